@@ -1,0 +1,1 @@
+"""bigs: two hands and the unknown object they hold, as 3D Gaussians, from one ordinary video, on a CPU."""
