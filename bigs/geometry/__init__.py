@@ -1,0 +1,1 @@
+"""Rotations, rigid transforms, meshes and surfaces: plain functions, no state."""
