@@ -1,0 +1,83 @@
+"""What a clip is once it is loaded: paths, camera, and per-frame initial estimates. Numpy, metres, radians.
+
+A clip's world is whatever the dataset chose; `cam_from_world` leads to the OpenCV camera of each frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bigs.data.images import read_image, read_mask
+from bigs.types import Entity, Side
+
+
+@dataclass(frozen=True)
+class HandTrack:
+    """One hand over the clip, in the clip's world, in that side's own MANO convention (nothing is mirrored).
+
+    `x_world = MANO(global_orient, hand_pose, betas) + transl`, where MANO turns about its rest wrist joint.
+    """
+
+    global_orient: np.ndarray  # [T, 3] axis-angle
+    hand_pose: np.ndarray  # [T, 15, 3] axis-angle relative to the model's hands_mean
+    transl: np.ndarray  # [T, 3] metres
+    betas: np.ndarray  # [10]
+    valid: np.ndarray  # [T] bool: there is an estimate; the others are filled from their neighbours
+
+
+@dataclass(frozen=True)
+class ObjectTrack:
+    """The object over the clip: `x_world = rotations (metric_from_canon x_canon) + transl`."""
+
+    points: np.ndarray  # [N, 3] canonical points as stored
+    colors: np.ndarray | None  # [N, 3] in [0, 1]; None when the file has none
+    scale: float  # metres per unit of the frame the points were reconstructed in
+    metric_from_canon: np.ndarray  # [4, 4]: diag(scale, scale, scale, 1) @ inv(norm_mat)
+    rotations: np.ndarray  # [T, 3, 3]
+    transl: np.ndarray  # [T, 3] metres
+    valid: np.ndarray  # [T] bool: there is an estimate; the others are filled from their neighbours
+
+    def points_world(self) -> np.ndarray:
+        """The points in every frame, [T, N, 3] metres, world."""
+        metric = self.points @ self.metric_from_canon[:3, :3].T + self.metric_from_canon[:3, 3]
+        return np.einsum("tij,nj->tni", self.rotations, metric) + self.transl[:, None]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A monocular clip with its initial estimates."""
+
+    name: str
+    folder: Path  # where image/, mask/ and data.npy lie
+    frame_names: tuple[str, ...]  # T original names
+    image_paths: tuple[Path, ...]
+    mask_paths: tuple[Path, ...]
+    width: int
+    height: int
+    K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
+    cam_from_world: np.ndarray  # [T, 4, 4] rigid, OpenCV camera axes
+    hands: dict[Side, HandTrack]
+    object: ObjectTrack | None
+    scene_scale: float  # the space HOLD trains in is scene_scale * world
+    normalize_shift: (
+        np.ndarray
+    )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
+    mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the masks; every entity has a key
+
+    def __len__(self) -> int:
+        return len(self.image_paths)
+
+    def image(self, t: int) -> np.ndarray:
+        """Frame `t`, [H, W, 3] uint8 RGB."""
+        return read_image(self.image_paths[t], (self.width, self.height))
+
+    def mask(self, t: int) -> np.ndarray:
+        """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""
+        return read_mask(self.mask_paths[t], (self.width, self.height))
+
+    def has_pixels(self, entity: Entity) -> np.ndarray:
+        """In which frames the masks show `entity`, [T] bool."""
+        return self.mask_areas[entity] > 0

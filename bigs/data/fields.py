@@ -1,0 +1,43 @@
+"""Taking fields out of somebody else's dictionary: present, of the right kind and shape, finite.
+
+`where` is the text that names the field in a message: the file, then the path of keys, as in
+`clip/build/data.npy: entities.right.hand_poses`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from bigs.checks import InputError, check_finite, check_shape
+
+
+def mapping_field(where: str, value: Any) -> Mapping[str, Any]:
+    """`value` if it is a dictionary, else an InputError."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{where}: expected a dictionary, found {type(value).__name__}")
+    return value
+
+
+def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: bool = True) -> np.ndarray:
+    """`value` (numpy or torch) as float64 of `shape`, finite unless told otherwise, else an InputError."""
+    array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"{where}: expected an array of numbers, found {type(value).__name__}")
+    check_shape(where, array, shape)
+    array = array.astype(np.float64)
+    if finite:
+        check_finite(where, array)
+    return array
+
+
+def require(where: str, values: Mapping[str, Any], key: str) -> Any:
+    """`values[key]`, or an InputError that lists what is there; `where` names the key in full."""
+    if key not in values:
+        keys = [str(key) for key in values]
+        found = ", ".join(keys[:8]) + (", ..." if len(keys) > 8 else "")
+        raise InputError(f"{where}: expected this field, found {f'only {found}' if keys else 'no fields'}")
+    return values[key]

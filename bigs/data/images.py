@@ -1,0 +1,99 @@
+"""Reading the frames of a clip: RGB images and label masks, each checked as it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from bigs.checks import InputError
+from bigs.types import MASK_VALUES, Entity
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+MASK_SUFFIXES = (".png",)
+
+# What Pillow raises for files that are not images, are cut short, or unpack to an absurd size.
+_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+def list_frames(folder: Path, suffixes: Sequence[str]) -> tuple[Path, ...]:
+    """The image files of `folder` in name order, which is frame order.
+
+    Raises:
+        InputError: the folder is missing or holds no such file.
+    """
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: expected a folder of frames, found {'a file' if folder.exists() else 'nothing'}"
+        )
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    if not paths:
+        raise InputError(f"{folder}: expected frames ({', '.join(suffixes)}), found none")
+    return tuple(paths)
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """One frame, [H, W, 3] uint8 RGB.
+
+    Args:
+        path: image file, 8-bit RGB or grey.
+        size: (width, height) it must have.
+
+    Raises:
+        InputError: unreadable, cut short, of another size, or neither RGB nor grey.
+    """
+    pixels, mode = _read(path, size)
+    if mode == "L":
+        return np.repeat(pixels[..., None], 3, axis=2)
+    if mode != "RGB":
+        raise InputError(f"{path}: expected an 8-bit RGB image, found mode {mode}")
+    return pixels
+
+
+def read_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """The labels of one frame, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`.
+
+    Raises:
+        InputError: unreadable, of another size, not one 8-bit channel, or holding any other value.
+    """
+    pixels, mode = _read(path, size)
+    if mode != "L":
+        raise InputError(f"{path}: expected a mask with one 8-bit channel (mode L), found mode {mode}")
+    values = np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
+    other = sorted(set(values.tolist()) - {0, *MASK_VALUES.values()})
+    if other:
+        expected = ", ".join(map(str, sorted({0, *MASK_VALUES.values()})))
+        raise InputError(
+            f"{path}: expected the mask values {expected}, found {', '.join(map(str, other[:4]))}"
+        )
+    return pixels
+
+
+def entity_mask(labels: np.ndarray, entity: Entity) -> np.ndarray:
+    """Where `labels` shows `entity`: bool, same shape."""
+    return labels == MASK_VALUES[entity]
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, str]:
+    try:
+        with Image.open(path) as image:
+            if size is not None and image.size != size:
+                raise InputError(
+                    f"{path}: expected {size[0]} x {size[1]} pixels as in the first frame, "
+                    f"found {image.width} x {image.height}"
+                )
+            return np.array(image), image.mode
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected an image, found no such file") from None
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: expected a readable image, found {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, Image.UnidentifiedImageError):
+        return "a file that is not an image"
+    return f"a damaged or truncated one ({error})"

@@ -1,0 +1,36 @@
+"""Filling the missing frames of a per-frame estimate: linear for vectors, along the arc for rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+
+def fill_vectors(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Replace invalid rows by interpolating their valid neighbours; the ends repeat the nearest valid row.
+
+    Args:
+        values: [T, D]; invalid rows may be NaN.
+        valid: [T] bool, at least one true.
+    """
+    frames = np.arange(len(valid))
+    known = frames[valid]
+    columns = [np.interp(frames, known, column[valid]) for column in values.T]
+    return np.where(valid[:, None], values, np.stack(columns, axis=1))
+
+
+def fill_rotations(rotvecs: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The same for axis-angle rotations [T, J, 3], interpolated on SO(3)."""
+    known = np.flatnonzero(valid)
+    missing = np.flatnonzero(~valid)
+    filled = rotvecs.copy()
+    if missing.size == 0:
+        return filled
+    if known.size == 1:
+        filled[missing] = rotvecs[known]
+        return filled
+    nearest = np.clip(missing, known[0], known[-1])
+    for joint in range(rotvecs.shape[1]):
+        arc = Slerp(known, Rotation.from_rotvec(rotvecs[known, joint]))
+        filled[missing, joint] = arc(nearest).as_rotvec()
+    return filled
