@@ -1,0 +1,111 @@
+"""Robust local-linear smoothing of trajectories of vectors and rotations over time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle, mean_rotation
+
+
+def interpolated_frames(values: Tensor, tolerance: float = 1e-6) -> Tensor:
+    """Frames [T] (bool) that look interpolated: a straight line through both neighbours.
+
+    Estimators fill gaps linearly; measured frames never have a second difference of exactly zero.
+
+    Args:
+        values: [T, D] positions.
+        tolerance: largest second difference, in units of `values`.
+    """
+    frames = torch.zeros(len(values), dtype=torch.bool)
+    if len(values) > 2:
+        second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+        frames[1:-1] = second.abs().amax(-1) < tolerance
+    return frames
+
+
+def smooth_vectors(values: Tensor, weights: Tensor, sigma: float) -> Tensor:
+    """Local-linear fit with Gaussian weights in time, made robust by re-weighting (Tukey's biweight).
+
+    Args:
+        values: [T, D].
+        weights: [T] trust in each frame, 0 to leave it out.
+        sigma: width of the window in frames; 0 returns `values`.
+
+    Returns:
+        [T, D].
+    """
+    if sigma <= 0 or len(values) < 3:
+        return values
+    offsets, near = _window(len(values), sigma)
+    trust = weights.clone()
+    for _ in range(3):
+        fitted = _local_linear(values[near.index], offsets, near.weight * trust[near.index])
+        trust = weights * _tukey((values - fitted).norm(dim=-1), weights)
+    return fitted
+
+
+def smooth_rotations(rotations: Tensor, weights: Tensor, sigma: float) -> Tensor:
+    """The same on SO(3): a local-linear fit in the tangent space at each window's robust mean.
+
+    Args:
+        rotations: [T, 3, 3].
+        weights: [T] trust in each frame.
+        sigma: width of the window in frames; 0 returns `rotations`.
+
+    Returns:
+        [T, 3, 3].
+    """
+    if sigma <= 0 or len(rotations) < 3:
+        return rotations
+    offsets, near = _window(len(rotations), sigma)
+    windows = rotations[near.index]  # [T, W, 3, 3]
+    trust = weights.clone()
+    for _ in range(3):
+        window_weights = near.weight * trust[near.index]
+        centre = mean_rotation(windows, window_weights + 1e-12)
+        tangent = matrix_to_axis_angle(centre[:, None].transpose(-1, -2) @ windows)
+        fitted = centre @ axis_angle_to_matrix(_local_linear(tangent, offsets, window_weights))
+        error = matrix_to_axis_angle(fitted.transpose(-1, -2) @ rotations).norm(dim=-1)
+        trust = weights * _tukey(error, weights)
+    return fitted
+
+
+class _Near:
+    """For every frame, the frames of its window [T, W] and their weights [T, W] (0 outside the clip)."""
+
+    def __init__(self, index: Tensor, weight: Tensor) -> None:
+        self.index = index
+        self.weight = weight
+
+
+def _window(frames: int, sigma: float) -> tuple[Tensor, _Near]:
+    reach = min(int(3 * sigma + 1), frames - 1)
+    offsets = torch.arange(-reach, reach + 1)
+    index = torch.arange(frames)[:, None] + offsets
+    inside = (index >= 0) & (index < frames)
+    weight = torch.exp(-0.5 * (offsets / sigma) ** 2) * inside
+    return offsets.float(), _Near(index.clamp(0, frames - 1), weight)
+
+
+def _local_linear(values: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
+    """Value at offset 0 of a weighted line through each window: [T, W, D], [W], [T, W] to [T, D]."""
+    total = weights.sum(1, keepdim=True).clamp_min(1e-12)
+    weights = weights / total
+    mean_x = (weights * offsets).sum(1, keepdim=True)
+    mean_y = (weights[..., None] * values).sum(1)
+    centred = offsets - mean_x
+    variance = (weights * centred**2).sum(1, keepdim=True)
+    slope = (weights[..., None] * centred[..., None] * values).sum(1) / variance.clamp_min(1e-3)
+    return mean_y - slope * mean_x
+
+
+def _tukey(residuals: Tensor, weights: Tensor) -> Tensor:
+    """Tukey's biweight of residual norms [T], with a cut-off from their own median."""
+    trusted = residuals[weights > 0]
+    if len(trusted) == 0:
+        return torch.ones_like(residuals)
+    # 1.48 median estimates a standard deviation; 4.685 of those is the usual cut-off. Norms of 3-vectors
+    # have a larger median than one coordinate's absolute value, so this errs on the side of keeping frames.
+    cut = 4.685 * 1.48 * trusted.median().clamp_min(1e-9)
+    return (1.0 - (residuals / cut).clamp(max=1.0) ** 2) ** 2

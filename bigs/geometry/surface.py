@@ -1,0 +1,161 @@
+"""An object's surface from its silhouettes and a sparse point cloud, as a signed distance on a grid.
+
+The visual hull is right where the object is convex and wrong in hollows; points with normals are right where
+there are points. The two are blended by the distance to the nearest point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import scipy.spatial
+import skimage.measure
+
+
+@dataclass(frozen=True)
+class DistanceGrid:
+    """Signed distances at the corners of a regular grid; negative inside."""
+
+    values: np.ndarray  # [X, Y, Z] metres
+    origin: np.ndarray  # [3] position of values[0, 0, 0]
+    spacing: float  # metres between neighbours
+
+    def points(self) -> np.ndarray:
+        """Positions [X * Y * Z, 3] of the grid's corners, in the order of `values.ravel()`."""
+        axes = [
+            origin + self.spacing * np.arange(n)
+            for origin, n in zip(self.origin, self.values.shape, strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def empty_grid(lower: np.ndarray, upper: np.ndarray, resolution: int) -> DistanceGrid:
+    """A grid over a box whose longest side has `resolution` cells."""
+    spacing = float((upper - lower).max()) / resolution
+    shape = np.ceil((upper - lower) / spacing).astype(int) + 1
+    return DistanceGrid(np.zeros(shape), lower.copy(), spacing)
+
+
+def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
+    """Signed distance in pixels to the border of a mask [H, W]: negative inside `allowed`."""
+    if allowed.all():
+        return np.full(allowed.shape, -float(max(allowed.shape)), dtype=np.float32)
+    outside = scipy.ndimage.distance_transform_edt(~allowed)
+    inside = scipy.ndimage.distance_transform_edt(allowed)
+    # Both count from pixel centres, so the border between two pixels is half a pixel from either.
+    return (np.where(allowed, 0.5 - inside, outside - 0.5)).astype(np.float32)
+
+
+def hull_distance(
+    points: np.ndarray, allowed: np.ndarray, K: np.ndarray, rotations: np.ndarray, centers: np.ndarray
+) -> np.ndarray:
+    """Distance of points to the visual hull: the largest over frames of the distance to the silhouette's cone.
+
+    Args:
+        points: [N, 3] metres, object frame.
+        allowed: [T, H, W] bool, where the object may be: its own pixels and those of whatever may hide it.
+        K: [3, 3] intrinsics of those masks.
+        rotations: [T, 3, 3]; x_cam = R x + centre.
+        centers: [T, 3].
+
+    Returns:
+        [N] metres, negative inside; a lower bound of the true distance outside. A point that no frame
+        sees counts as inside by a large amount.
+    """
+    height, width = allowed.shape[1:]
+    largest = np.full(len(points), -np.inf)
+    for mask, rotation, center in zip(allowed, rotations, centers, strict=True):
+        cam = points @ rotation.T + center
+        depth = cam[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = K[0, 0] * cam[:, 0] / depth + K[0, 2] - 0.5
+            v = K[1, 1] * cam[:, 1] / depth + K[1, 2] - 0.5
+        seen = (depth > 1e-3) & (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
+        pixels = scipy.ndimage.map_coordinates(
+            silhouette_distance(mask), np.stack([v[seen], u[seen]]), order=1, prefilter=False
+        )
+        largest[seen] = np.maximum(largest[seen], pixels * depth[seen] / K[0, 0])
+    return np.where(np.isfinite(largest), largest, -1.0)
+
+
+def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12) -> np.ndarray:
+    """Normals [N, 3] of a point cloud by local planes, turned to agree with the directions `outward` [N, 3]."""
+    _, index = scipy.spatial.cKDTree(points).query(points, k=min(neighbours, len(points)))
+    patches = points[index] - points[index].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))
+    normals = axes[:, :, 0]
+    return normals * np.where((normals * outward).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+
+
+def inlier_points(points: np.ndarray, neighbours: int = 6, factor: float = 3.0) -> np.ndarray:
+    """Which points [N] (bool) have neighbours as near as the others do; the rest are stray."""
+    if len(points) <= neighbours:
+        return np.ones(len(points), dtype=bool)
+    distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours + 1)
+    mean = distance[:, 1:].mean(axis=1)
+    return mean < factor * np.median(mean)
+
+
+def blend_with_points(
+    grid: DistanceGrid,
+    points: np.ndarray,
+    normals: np.ndarray,
+    reach: float,
+    neighbours: int = 8,
+) -> DistanceGrid:
+    """Replace a grid's distance near points by the distance to their planes (moving least squares).
+
+    Args:
+        grid: distances to the hull.
+        points: [N, 3] metres.
+        normals: [N, 3] unit, outward.
+        reach: metres; at this distance from the nearest point the grid's own value is back in full.
+
+    Returns:
+        A new grid. It never reaches outside the old one: the hull is an upper bound of the object.
+    """
+    corners = grid.points()
+    values = grid.values.ravel().copy()
+    # Far outside, the sign is known already and only the sign matters there.
+    near = np.flatnonzero(values < reach)
+    distance, index = scipy.spatial.cKDTree(points).query(
+        corners[near], k=min(neighbours, len(points)), distance_upper_bound=reach, workers=-1
+    )
+    has = np.isfinite(distance[:, 0])
+    near, distance, index = near[has], distance[has], index[has]
+    weights = np.where(np.isfinite(distance), np.exp(-0.5 * (distance / (0.35 * reach)) ** 2), 0.0)
+    index = np.where(np.isfinite(distance), index, 0)
+    plane = ((corners[near, None] - points[index]) * normals[index]).sum(-1)
+    plane = (weights * plane).sum(1) / weights.sum(1)
+    share = 1.0 - distance[:, 0] / reach
+    share = share * share * (3.0 - 2.0 * share)
+    values[near] = np.maximum(share * plane + (1.0 - share) * values[near], values[near])
+    return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)
+
+
+def extract_mesh(grid: DistanceGrid) -> tuple[np.ndarray, np.ndarray]:
+    """The zero level set's largest piece: vertices [V, 3] and faces [F, 3] with outward winding.
+
+    Raises:
+        ValueError: the grid has no zero crossing.
+    """
+    padded = np.pad(grid.values, 1, constant_values=max(grid.spacing, float(grid.values.max())))
+    verts, faces, _, _ = skimage.measure.marching_cubes(padded, 0.0, spacing=(grid.spacing,) * 3)
+    verts = verts + grid.origin - grid.spacing
+    label = _components(len(verts), faces)
+    largest = np.bincount(label[faces[:, 0]]).argmax()
+    faces = faces[label[faces[:, 0]] == largest]
+    used, faces = np.unique(faces, return_inverse=True)
+    verts, faces = verts[used], faces.reshape(-1, 3)
+    corners = verts[faces]
+    volume = np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return verts, faces if volume > 0 else faces[:, ::-1]
+
+
+def _components(n_verts: int, faces: np.ndarray) -> np.ndarray:
+    """Label [V] of the connected piece that each vertex belongs to."""
+    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n_verts, n_verts))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

@@ -1,0 +1,180 @@
+"""The hands' Gaussians: one canonical right hand for both sides (paper section 3.2, Eq. 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.spatial
+import torch
+from torch import Tensor, nn
+
+from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder, SkinningDecoder
+from bigs.fields.triplane import Triplane, TriplaneConfig
+from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
+from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.hand import HandModel, mirror_points, skin_points
+from bigs.models.poses import HandFrames
+from bigs.types import Gaussians, Side
+
+
+@dataclass(frozen=True)
+class HandSplatsConfig:
+    """How the hand is covered with Gaussians and how its field is built."""
+
+    triplane: TriplaneConfig = TriplaneConfig(features=16, resolution=128)
+    decoders: DecoderConfig = DecoderConfig()
+    # Midpoint subdivisions of the template's mesh. The released code uses three (49k Gaussians); an image in
+    # which the hand is 100 pixels long cannot show more than one.
+    subdivisions: int = 1
+    # Share one canonical hand (and one shape) between both sides; the paper's "share".
+    shared: bool = True
+    # Let the geometry field move, turn and scale the Gaussians. The released code freezes them.
+    learn_geometry: bool = True
+    # Standard deviations at the start: along the surface in units of the local spacing, across it in units
+    # of the former.
+    scale_per_spacing: float = 0.55
+    flatness: float = 0.35
+    opacity: float = 0.95
+    max_offset: float = 0.003
+    # The mean colour of skin under white light is only the start; a stage may begin from the images' own.
+    color: tuple[float, float, float] = (0.7, 0.55, 0.45)
+
+
+class CanonicalHand(NamedTuple):
+    """The right hand's Gaussians before posing, N of them."""
+
+    points: Tensor  # [N, 3] metres, shaped rest pose, offsets included
+    weights: Tensor  # [N, 16]
+    target_weights: Tensor  # [N, 16] what the LBS regulariser pulls to
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3]
+    normals: Tensor  # [N, 3] unit, rest pose
+
+
+class HandSplats(nn.Module):
+    """A canonical right hand: Gaussians on the (subdivided) template surface, changed by triplane fields."""
+
+    def __init__(self, model: HandModel, config: HandSplatsConfig) -> None:
+        """`model` is the right hand."""
+        super().__init__()
+        self.model = model
+        self.config = config
+        points, faces = model.v_template.numpy().astype(np.float64), model.faces.numpy()
+        follow = None
+        for _ in range(config.subdivisions):
+            step, faces = midpoint_subdivision(faces, len(points))
+            points = step @ points
+            follow = step if follow is None else step @ follow
+        n_template = len(model.v_template)
+
+        def carry(values: Tensor) -> Tensor:
+            """Vertex attributes [V, ...] at the Gaussians."""
+            if follow is None:
+                return values.clone()
+            flat = values.reshape(n_template, -1).numpy().astype(np.float64)
+            return torch.from_numpy(follow @ flat).to(values.dtype).reshape(-1, *values.shape[1:])
+
+        normals = vertex_normals(points, faces)
+        spacing = point_spacing(points)
+        sigma = config.scale_per_spacing * spacing
+        as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
+        # The soft silhouette of a Gaussian on the surface reaches past it; the centres go in by as much.
+        inset = config.flatness * sigma[:, None] * normals
+        self.register_buffer("base_points", as_tensor(points - inset), persistent=False)
+        self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)
+        self.register_buffer(
+            "posedirs", carry(model.posedirs) if model.has_posedirs else torch.zeros(0), persistent=False
+        )
+        self.register_buffer("normals", as_tensor(normals), persistent=False)
+        self.register_buffer(
+            "base_weights", neighbour_weights(points, model.v_template, model.lbs_weights), persistent=False
+        )
+        self.register_buffer(
+            "base_quats", matrix_to_quat(as_tensor(frames_from_normals(normals))), persistent=False
+        )
+        base_scales = sigma[:, None] * np.array([1.0, 1.0, config.flatness])
+        self.register_buffer("base_log_scales", as_tensor(np.log(base_scales)), persistent=False)
+
+        bounds = torch.stack([self.base_points.amin(0), self.base_points.amax(0)])
+        margin = 0.02 * (bounds[1] - bounds[0])
+        self.triplane = Triplane(config.triplane, torch.stack([bounds[0] - margin, bounds[1] + margin]))
+        features = self.triplane.out_features
+        self.appearance = AppearanceDecoder(features, config.decoders.appearance_width)
+        self.geometry = GeometryDecoder(features, config.decoders.geometry_width, config.max_offset)
+        self.skinning = SkinningDecoder(features, config.decoders.skinning_width)
+        self.color_logit = nn.Parameter(torch.logit(torch.tensor(config.color)))
+
+    def forward(self, betas: Tensor) -> CanonicalHand:
+        """Evaluate the fields once: the canonical Gaussians of the shape `betas` [10]."""
+        # The query points do not depend on the shape: the field belongs to the surface, not to space.
+        features = self.triplane(self.base_points)
+        appearance = self.appearance(
+            features,
+            self.color_logit.expand(len(features), 3),
+            torch.logit(features.new_tensor(self.config.opacity)).expand(len(features)),
+        )
+        points = self.base_points + self.shapedirs @ betas
+        quats, log_scales = self.base_quats, self.base_log_scales
+        if self.config.learn_geometry:
+            geometry = self.geometry(features)
+            points = points + geometry.offsets
+            quats = quat_multiply(matrix_to_quat(geometry.rotations), quats)
+            log_scales = log_scales + geometry.log_scales
+        return CanonicalHand(
+            points,
+            self.skinning(features, self.base_weights),
+            self.base_weights,
+            quats,
+            log_scales.exp(),
+            appearance.opacities,
+            appearance.colors,
+            self.normals,
+        )
+
+    def pose(self, hand: CanonicalHand, betas: Tensor, frames: HandFrames, side: Side) -> Gaussians:
+        """Carry the canonical Gaussians to B frames, in camera space (paper Eq. 3; a left hand is mirrored).
+
+        `frames` are poses of the canonical (right) hand: for a left hand, of its mirror image.
+        """
+        bones = self.model(betas, frames.hand_pose, frames.global_orient, frames.wrist).bone_transforms
+        points = hand.points
+        if self.posedirs.numel():
+            features = (frames.hand_pose - torch.eye(3)).flatten(-3)
+            points = points + (features @ self.posedirs.reshape(-1, 135).T).reshape(len(bones), -1, 3)
+        means = skin_points(points, hand.weights, bones)
+        quats = quat_multiply(blend_quats(hand.weights, bones), hand.quats)
+        if side == "left":
+            means = mirror_points(means)
+            # S R S for S = diag(-1, 1, 1): the same turn as seen in the mirror.
+            quats = quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
+        return Gaussians(means, quats, hand.scales, hand.opacities, hand.colors)
+
+
+def blend_quats(weights: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Orientation [B, N, 4] of skinned points: the weighted sum of the bones' quaternions, signs aligned.
+
+    Cheaper than a matrix-to-quaternion conversion a Gaussian and frame, and equal to it where one bone rules.
+    The result need not be unit.
+    """
+    quats = matrix_to_quat(bone_transforms[..., :3, :3])
+    aligned = torch.where((quats * quats[:, :1]).sum(-1, keepdim=True) < 0, -quats, quats)
+    return weights @ aligned
+
+
+def neighbour_weights(points: np.ndarray, verts: Tensor, lbs_weights: Tensor, neighbours: int = 6) -> Tensor:
+    """Pseudo ground truth of the LBS regulariser: distance-weighted mean over the 6 nearest vertices.
+
+    A point that coincides with a vertex takes that vertex's weights.
+
+    Returns:
+        [N, 16], rows sum to one.
+    """
+    distance, index = scipy.spatial.cKDTree(verts.numpy()).query(points, k=neighbours)
+    closeness = 1.0 / np.maximum(distance, 1e-6) ** 2
+    closeness /= closeness.sum(axis=1, keepdims=True)
+    blended = np.einsum("nk,nkj->nj", closeness, lbs_weights.numpy()[index])
+    return torch.as_tensor(blended / blended.sum(axis=1, keepdims=True), dtype=torch.float32)

@@ -1,0 +1,101 @@
+"""The object's Gaussians: on the surface that the initial estimates give, changed by triplane fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder
+from bigs.fields.triplane import Triplane, TriplaneConfig
+from bigs.geometry.mesh import frames_from_normals, point_spacing
+from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.models.poses import ObjectFrames
+from bigs.types import Gaussians
+
+
+@dataclass(frozen=True)
+class ObjectSplatsConfig:
+    """How the object is covered with Gaussians and how its field is built."""
+
+    triplane: TriplaneConfig = TriplaneConfig(features=16, resolution=128)
+    decoders: DecoderConfig = DecoderConfig()
+    # Gaussians at the start, spread evenly over the initial surface; the paper starts from at least 10000.
+    n_gaussians: int = 6000
+    # Upper limit for densification.
+    max_gaussians: int = 50_000
+    scale_per_spacing: float = 0.6
+    flatness: float = 0.35
+    opacity: float = 0.95
+    max_offset: float = 0.006
+    # One scale for all three axes, as the released code has it; the paper's Eq. 1 has three.
+    isotropic: bool = False
+
+
+class CanonicalObject(NamedTuple):
+    """The object's Gaussians in its own frame, N of them."""
+
+    means: Tensor  # [N, 3] metres at the initial size, offsets included
+    offsets: Tensor  # [N, 3] what the field added to the start
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3]
+    normals: Tensor  # [N, 3] unit
+
+
+class ObjectSplats(nn.Module):
+    """A canonical object: Gaussians on an initial surface, changed by triplane fields."""
+
+    def __init__(
+        self, points: np.ndarray, normals: np.ndarray, colors: np.ndarray, config: ObjectSplatsConfig
+    ) -> None:
+        """Starts: points [N, 3] (metres), unit normals [N, 3] and colours [N, 3] in [0, 1]."""
+        super().__init__()
+        self.config = config
+        as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
+        sigma = config.scale_per_spacing * point_spacing(points)
+        flatness = 1.0 if config.isotropic else config.flatness
+        inset = flatness * sigma[:, None] * normals
+        # Buffers, not constants: densification changes their length, so a checkpoint must carry them.
+        self.register_buffer("base_points", as_tensor(points - inset))
+        self.register_buffer("normals", as_tensor(normals))
+        self.register_buffer("base_quats", matrix_to_quat(as_tensor(frames_from_normals(normals))))
+        scales = sigma[:, None] * np.array([1.0, 1.0, flatness])
+        self.register_buffer("base_log_scales", as_tensor(np.log(scales)))
+        self.register_buffer("color_logits", torch.logit(as_tensor(colors).clamp(0.02, 0.98)))
+
+        bounds = torch.stack([self.base_points.amin(0), self.base_points.amax(0)])
+        margin = 0.05 * (bounds[1] - bounds[0]) + config.max_offset
+        self.triplane = Triplane(config.triplane, torch.stack([bounds[0] - margin, bounds[1] + margin]))
+        features = self.triplane.out_features
+        self.appearance = AppearanceDecoder(features, config.decoders.appearance_width)
+        self.geometry = GeometryDecoder(features, config.decoders.geometry_width, config.max_offset)
+
+    def forward(self) -> CanonicalObject:
+        """Evaluate the fields once."""
+        features = self.triplane(self.base_points)
+        start = torch.logit(features.new_tensor(self.config.opacity)).expand(len(features))
+        appearance = self.appearance(features, self.color_logits, start)
+        geometry = self.geometry(features)
+        log_scales = self.base_log_scales + (
+            geometry.log_scales.mean(-1, keepdim=True) if self.config.isotropic else geometry.log_scales
+        )
+        return CanonicalObject(
+            self.base_points + geometry.offsets,
+            geometry.offsets,
+            quat_multiply(matrix_to_quat(geometry.rotations), self.base_quats),
+            log_scales.exp(),
+            appearance.opacities,
+            appearance.colors,
+            self.normals,
+        )
+
+    def pose(self, obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:
+        """Carry the canonical Gaussians to B frames, in camera space."""
+        means = frames.scale * obj.means @ frames.rotations.transpose(-1, -2) + frames.centers[:, None]
+        quats = quat_multiply(matrix_to_quat(frames.rotations)[:, None], obj.quats)
+        return Gaussians(means, quats, frames.scale * obj.scales, obj.opacities, obj.colors)

@@ -1,0 +1,99 @@
+"""Per-frame poses: fixed estimates plus trainable residuals, composed on SO(3).
+
+Positions are a ray and a logarithmic depth: an image hardly shows depth, so the two need separate rates, and
+a step in log depth is the same fraction near and far.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from bigs.geometry.rotations import axis_angle_to_matrix
+
+
+class HandFrames(NamedTuple):
+    """Poses of one hand at B frames, in the canonical (right) hand's coordinates of a mirrored or plain camera."""
+
+    global_orient: Tensor  # [B, 3, 3]
+    hand_pose: Tensor  # [B, 15, 3, 3]
+    wrist: Tensor  # [B, 3] metres
+
+
+class ObjectFrames(NamedTuple):
+    """Similarity poses of the object at B frames: x_cam = scale * R x + centre."""
+
+    rotations: Tensor  # [B, 3, 3]
+    centers: Tensor  # [B, 3] metres
+    scale: Tensor  # [] one number for the clip
+
+
+class RayPositions(nn.Module):
+    """Positions in camera space as a point on the z = 1 plane and a logarithmic depth."""
+
+    def __init__(self, positions: Tensor) -> None:
+        """`positions` [T, 3], metres, z > 0: where the residuals start from."""
+        super().__init__()
+        frames = positions.shape[0]
+        self.register_buffer("base_ray", positions[:, :2] / positions[:, 2:])
+        self.register_buffer("base_log_depth", positions[:, 2].log())
+        self.ray = nn.Parameter(torch.zeros(frames, 2))
+        self.log_depth = nn.Parameter(torch.zeros(frames))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Positions [B, 3] of `frames` [B]."""
+        depth = torch.exp(self.base_log_depth[frames] + self.log_depth[frames])
+        ray = self.base_ray[frames] + self.ray[frames]
+        return torch.cat([ray * depth[:, None], depth[:, None]], dim=-1)
+
+
+class HandPoses(nn.Module):
+    """One hand's poses over a clip. A left hand's are stored mirrored, as poses of the canonical right hand."""
+
+    def __init__(self, global_orient: Tensor, hand_pose: Tensor, wrist: Tensor) -> None:
+        """Starts: rotations [T, 3, 3] and [T, 15, 3, 3], wrist joint positions [T, 3] in metres."""
+        super().__init__()
+        frames = global_orient.shape[0]
+        self.register_buffer("base_orient", global_orient)
+        self.register_buffer("base_pose", hand_pose)
+        self.orient = nn.Parameter(torch.zeros(frames, 3))
+        self.pose = nn.Parameter(torch.zeros(frames, 15, 3))
+        # What a per-frame regressor gets wrong in every frame alike.
+        self.pose_bias = nn.Parameter(torch.zeros(15, 3))
+        self.position = RayPositions(wrist)
+
+    def forward(self, frames: Tensor) -> HandFrames:
+        """The poses of `frames` [B] (integer indices)."""
+        residual = axis_angle_to_matrix(self.pose[frames] + self.pose_bias)
+        return HandFrames(
+            axis_angle_to_matrix(self.orient[frames]) @ self.base_orient[frames],
+            self.base_pose[frames] @ residual,
+            self.position(frames),
+        )
+
+
+class ObjectPoses(nn.Module):
+    """The object's poses over a clip and its size.
+
+    One logarithmic scale multiplies size *and* depth, so that changing it leaves the projection alone: that
+    is the one quantity a single camera cannot see.
+    """
+
+    def __init__(self, rotations: Tensor, centers: Tensor) -> None:
+        """Starts: rotations [T, 3, 3] and positions [T, 3] (metres) of the canonical origin."""
+        super().__init__()
+        self.register_buffer("base_orient", rotations)
+        self.orient = nn.Parameter(torch.zeros(rotations.shape[0], 3))
+        self.position = RayPositions(centers)
+        self.log_scale = nn.Parameter(torch.zeros(()))
+
+    def forward(self, frames: Tensor) -> ObjectFrames:
+        """The poses of `frames` [B]."""
+        scale = self.log_scale.exp()
+        return ObjectFrames(
+            axis_angle_to_matrix(self.orient[frames]) @ self.base_orient[frames],
+            scale * self.position(frames),
+            scale,
+        )
