@@ -1,0 +1,129 @@
+"""Ground truth of a clip: `gt.npz` and, beside it, the true object as `gt_object.ply`.
+
+All is in the OpenCV camera frame of its time, metres: hand vertices are LBS(pose, betas) + trans, object points
+obj_R (obj_scale x) + obj_t for x of `gt_object.ply`.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from bigs.checks import InputError
+from bigs.data.fields import array_field, require
+from bigs.types import SIDES, HandObjectTrajectory, Side
+
+OBJECT_FILE = "gt_object.ply"
+
+
+def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
+    """Read the true joints and meshes of a clip.
+
+    Args:
+        path: `gt.npz`, or the clip folder that holds it.
+
+    Returns:
+        The trajectory; frames are named by `build/corres.txt` when the clip has one.
+
+    Raises:
+        InputError: a missing or damaged file or field, or fields that disagree about the number of frames.
+    """
+    path = Path(path)
+    file = path / "gt.npz" if path.is_dir() else path
+    arrays = _read_npz(file)
+    present = [side for side in SIDES if f"{side}_verts" in arrays]
+    has_object = "obj_R" in arrays
+    if not present and not has_object:
+        raise InputError(
+            f"{file}: expected right_verts, left_verts or obj_R, found {', '.join(arrays) or 'nothing'}"
+        )
+    frames = len(arrays[f"{present[0]}_verts" if present else "obj_R"])
+
+    verts: dict[Side, np.ndarray] = {}
+    joints: dict[Side, np.ndarray] = {}
+    faces: dict[Side, np.ndarray] = {}
+    for side in present:
+        verts[side] = _field(file, arrays, f"{side}_verts", (frames, "V", 3))
+        joints[side] = _field(file, arrays, f"{side}_joints", (frames, 21, 3))
+        faces[side] = _read_faces(file, arrays, f"{side}_faces", verts[side].shape[1])
+    object_verts, object_faces = _read_object(file, arrays, frames) if has_object else (None, None)
+    return HandObjectTrajectory(
+        name=file.resolve().parent.name,
+        frame_names=_frame_names(file, frames),
+        joints=joints,
+        verts=verts,
+        faces=faces,
+        object_verts=object_verts,
+        object_faces=object_faces,
+    )
+
+
+def write_ground_truth(
+    folder: str | Path, *, arrays: Mapping[str, Any], object_mesh: trimesh.Trimesh | None
+) -> Path:
+    """Write `gt.npz` from `arrays`, named as `load_ground_truth` reads them, and the true mesh."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(folder / "gt.npz", **arrays)
+    if object_mesh is not None:
+        object_mesh.export(folder / OBJECT_FILE)
+    return folder / "gt.npz"
+
+
+def _read_npz(file: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except FileNotFoundError:
+        raise InputError(f"{file}: expected ground truth, found no such file") from None
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{file}: expected an .npz of plain arrays, found {error or type(error).__name__}"
+        ) from None
+
+
+def _read_object(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> tuple[np.ndarray, np.ndarray]:
+    rotations = _field(file, arrays, "obj_R", (frames, 3, 3))
+    transl = _field(file, arrays, "obj_t", (frames, 3))
+    scale = float(_field(file, arrays, "obj_scale", ())) if "obj_scale" in arrays else 1.0
+    mesh_file = file.parent / OBJECT_FILE
+    if not mesh_file.is_file():
+        raise InputError(f"{mesh_file}: expected the true object beside {file.name}, found no such file")
+    try:
+        mesh = trimesh.load_mesh(mesh_file, process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
+        raise InputError(
+            f"{mesh_file}: expected a triangle mesh, found {error or type(error).__name__}"
+        ) from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"{mesh_file}: expected a triangle mesh, found one without faces")
+    verts = np.einsum("tij,nj->tni", rotations, scale * np.asarray(mesh.vertices)) + transl[:, None]
+    return verts, np.asarray(mesh.faces)
+
+
+def _read_faces(file: Path, arrays: Mapping[str, np.ndarray], key: str, vertex_count: int) -> np.ndarray:
+    faces = _field(file, arrays, key, ("F", 3)).astype(np.int64)
+    if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
+        raise InputError(
+            f"{file}: {key}: expected indices below {vertex_count}, found {faces.min()} to {faces.max()}"
+        )
+    return faces
+
+
+def _frame_names(file: Path, frames: int) -> tuple[str, ...]:
+    corres = file.parent / "build" / "corres.txt"
+    names = corres.read_text().split() if corres.is_file() else []
+    if names and len(names) != frames:
+        raise InputError(f"{file}: expected the {len(names)} frames that {corres} lists, found {frames}")
+    return tuple(names) or tuple(f"{t:04d}" for t in range(frames))
+
+
+def _field(
+    file: Path, arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | str, ...]
+) -> np.ndarray:
+    return array_field(f"{file}: {key}", require(f"{file}: {key}", arrays, key), shape)
