@@ -15,6 +15,7 @@ from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.hand import HandModel, mirror_points, skin_points
+from bigs.hand.lbs import pose_corrective
 from bigs.models.poses import HandFrames
 from bigs.types import Gaussians, Side
 
@@ -43,16 +44,16 @@ class HandSplatsConfig:
 
 
 class CanonicalHand(NamedTuple):
-    """The right hand's Gaussians before posing, N of them."""
+    """N Gaussians of the right hand before shaping and posing."""
 
-    points: Tensor  # [N, 3] metres, shaped rest pose, offsets included
+    points: Tensor  # [N, 3] metres, mean shape, rest pose
+    shapedirs: Tensor  # [N, 3, 10]
+    posedirs: Tensor | None  # [N, 3, 135]; None when the model has none
     weights: Tensor  # [N, 16]
-    target_weights: Tensor  # [N, 16] what the LBS regulariser pulls to
-    quats: Tensor  # [N, 4]
+    quats: Tensor | None  # [N, 4]; None for isotropic Gaussians
     scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
-    colors: Tensor  # [N, 3]
-    normals: Tensor  # [N, 3] unit, rest pose
+    colors: Tensor  # [N, D]
 
 
 class HandSplats(nn.Module):
@@ -86,10 +87,8 @@ class HandSplats(nn.Module):
         inset = config.flatness * sigma[:, None] * normals
         self.register_buffer("base_points", as_tensor(points - inset), persistent=False)
         self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)
-        self.register_buffer(
-            "posedirs", carry(model.posedirs) if model.has_posedirs else torch.zeros(0), persistent=False
-        )
-        self.register_buffer("normals", as_tensor(normals), persistent=False)
+        if model.has_posedirs:
+            self.register_buffer("posedirs", carry(model.posedirs), persistent=False)
         self.register_buffer(
             "base_weights", neighbour_weights(points, model.v_template, model.lbs_weights), persistent=False
         )
@@ -108,8 +107,8 @@ class HandSplats(nn.Module):
         self.skinning = SkinningDecoder(features, config.decoders.skinning_width)
         self.color_logit = nn.Parameter(torch.logit(torch.tensor(config.color)))
 
-    def forward(self, betas: Tensor) -> CanonicalHand:
-        """Evaluate the fields once: the canonical Gaussians of the shape `betas` [10]."""
+    def forward(self) -> CanonicalHand:
+        """Evaluate the fields once."""
         # The query points do not depend on the shape: the field belongs to the surface, not to space.
         features = self.triplane(self.base_points)
         appearance = self.appearance(
@@ -117,8 +116,7 @@ class HandSplats(nn.Module):
             self.color_logit.expand(len(features), 3),
             torch.logit(features.new_tensor(self.config.opacity)).expand(len(features)),
         )
-        points = self.base_points + self.shapedirs @ betas
-        quats, log_scales = self.base_quats, self.base_log_scales
+        points, quats, log_scales = self.base_points, self.base_quats, self.base_log_scales
         if self.config.learn_geometry:
             geometry = self.geometry(features)
             points = points + geometry.offsets
@@ -126,32 +124,65 @@ class HandSplats(nn.Module):
             log_scales = log_scales + geometry.log_scales
         return CanonicalHand(
             points,
+            self.shapedirs,
+            self.posedirs if self.model.has_posedirs else None,
             self.skinning(features, self.base_weights),
-            self.base_weights,
             quats,
             log_scales.exp(),
             appearance.opacities,
             appearance.colors,
-            self.normals,
         )
 
-    def pose(self, hand: CanonicalHand, betas: Tensor, frames: HandFrames, side: Side) -> Gaussians:
-        """Carry the canonical Gaussians to B frames, in camera space (paper Eq. 3; a left hand is mirrored).
 
-        `frames` are poses of the canonical (right) hand: for a left hand, of its mirror image.
-        """
-        bones = self.model(betas, frames.hand_pose, frames.global_orient, frames.wrist).bone_transforms
-        points = hand.points
-        if self.posedirs.numel():
-            features = (frames.hand_pose - torch.eye(3)).flatten(-3)
-            points = points + (features @ self.posedirs.reshape(-1, 135).T).reshape(len(bones), -1, 3)
-        means = skin_points(points, hand.weights, bones)
+def silhouette_hand(model: HandModel, sigma: float, inset: float, colors: Tensor) -> CanonicalHand:
+    """Opaque isotropic Gaussians on the template's vertices: enough for silhouettes, and few.
+
+    Args:
+        model: the right hand.
+        sigma: standard deviation, metres.
+        inset: metres by which centres go in along the normal, so that the soft outline falls on the surface.
+        colors: [V, D] whatever the image shall show per vertex.
+    """
+    normals = vertex_normals(model.v_template.numpy().astype(np.float64), model.faces.numpy())
+    count = len(model.v_template)
+    return CanonicalHand(
+        model.v_template - inset * torch.as_tensor(normals, dtype=torch.float32),
+        model.shapedirs,
+        model.posedirs if model.has_posedirs else None,
+        model.lbs_weights,
+        None,
+        torch.full((count, 3), sigma),
+        torch.ones(count),
+        colors,
+    )
+
+
+def pose_hand(
+    model: HandModel, hand: CanonicalHand, betas: Tensor, frames: HandFrames, side: Side
+) -> Gaussians:
+    """Carry canonical Gaussians to B frames, in camera space (paper Eq. 3; a left hand is mirrored).
+
+    Args:
+        model: the right hand.
+        hand: its Gaussians.
+        betas: [10].
+        frames: poses of the canonical (right) hand: for a left hand, of its mirror image.
+        side: which hand to show.
+    """
+    bones = model(betas, frames.hand_pose, frames.global_orient, frames.wrist).bone_transforms
+    points = hand.points + hand.shapedirs @ betas
+    if hand.posedirs is not None:
+        points = points + pose_corrective(hand.posedirs, frames.hand_pose)
+    means = skin_points(points, hand.weights, bones)
+    if hand.quats is None:
+        quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(points), 4)
+    else:
         quats = quat_multiply(blend_quats(hand.weights, bones), hand.quats)
-        if side == "left":
-            means = mirror_points(means)
-            # S R S for S = diag(-1, 1, 1): the same turn as seen in the mirror.
-            quats = quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
-        return Gaussians(means, quats, hand.scales, hand.opacities, hand.colors)
+    if side == "left":
+        means = mirror_points(means)
+        # S R S for S = diag(-1, 1, 1): the same turn as seen in the mirror.
+        quats = quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
+    return Gaussians(means, quats, hand.scales, hand.opacities, hand.colors)
 
 
 def blend_quats(weights: Tensor, bone_transforms: Tensor) -> Tensor:

@@ -1,0 +1,48 @@
+"""Contact between hands and object: the paper's pull of centres, and a pull of nearest surfaces."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def center_contact(object_centers: Tensor, wrists: Tensor, touching: Tensor) -> Tensor:
+    """||Gamma_O - Gamma_H||_2 (paper Eq. 8) for one hand, a mean over the frames in which it touches.
+
+    Args:
+        object_centers, wrists: [B, 3] metres.
+        touching: [B] in [0, 1].
+    """
+    distance = (object_centers - wrists).norm(dim=-1)
+    return (distance * touching).sum() / touching.sum().clamp_min(1.0)
+
+
+def nearest_mean(distances: Tensor, count: int) -> Tensor:
+    """Mean [B] of the `count` smallest absolute values of `distances` [B, V]."""
+    return distances.abs().topk(min(count, distances.shape[1]), dim=1, largest=False).values.mean(1)
+
+
+def surface_contact(distances: Tensor, touching: Tensor, count: int = 30, reach: float = 0.01) -> Tensor:
+    """Draws the nearest part of a hand to the object's surface where the image shows touch.
+
+    d / (d + reach) of the mean distance of the nearest vertices: it saturates, so that a frame whose pose is
+    wrong altogether does not outweigh the rest.
+
+    Args:
+        distances: [B, V] signed distances of the hand's vertices from the object, metres.
+        touching: [B] in [0, 1].
+        count: how many vertices count as the touching part.
+        reach: metres at which the pull has fallen by half.
+    """
+    nearest = nearest_mean(distances, count)
+    return (nearest / (nearest + reach) * touching).sum() / touching.sum().clamp_min(1.0)
+
+
+def penetration(distances: Tensor, tolerance: float = 0.001) -> Tensor:
+    """Squared depth beyond `tolerance` (metres), in centimetres, summed over vertices, a mean over frames.
+
+    Args:
+        distances: [B, V] signed distances from the object, metres.
+    """
+    depth = 100.0 * torch.relu(-distances - tolerance)
+    return depth.square().sum(1).mean()

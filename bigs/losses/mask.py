@@ -1,0 +1,45 @@
+"""What silhouettes say: nothing outside the foreground, and each subject where its mask is."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
+    """The paper's mask regulariser (1 - m) I_pred (Eq. 5), a mean over the outside's pixels and channels.
+
+    Args:
+        pred: [B, H, W, D], rendered on black.
+        foreground: [B, H, W] in [0, 1], union of all subjects' masks.
+    """
+    outside = 1.0 - foreground
+    return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
+
+
+def amodal_silhouette(
+    alpha: Tensor, own: Tensor, hidden: Tensor, weight: Tensor | float = 1.0
+) -> Tensor:
+    """One subject, rendered alone, against its own visible mask; where others may hide it, anything goes.
+
+    A pixel whose area belongs to the subject by `own` and to possible occluders by `hidden` allows any alpha
+    between `own` and `own + hidden`. Squared excess, summed over pixels, per pixel of the subject.
+
+    Args:
+        alpha: [B, H, W] rendered coverage.
+        own: [B, H, W] visible share of each pixel in [0, 1].
+        hidden: [B, H, W] share in which the subject may be hidden.
+        weight: [B, H, W] or a number, how far to trust each pixel.
+    """
+    missing = (own - alpha).clamp_min(0.0)
+    excess = (alpha - own - hidden).clamp_min(0.0)
+    return (weight * (missing.square() + excess.square())).sum() / own.sum().clamp_min(1.0)
+
+
+def label_difference(pred: Tensor, labels: Tensor) -> Tensor:
+    """Entity channels of one joint rendering against the visible masks: occlusion order included.
+
+    Args:
+        pred: [B, H, W, E] rendered label channels.
+        labels: [B, H, W, E] visible shares.
+    """
+    return (pred - labels).square().sum() / labels.sum().clamp_min(1.0)

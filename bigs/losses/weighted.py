@@ -1,0 +1,16 @@
+"""A loss is a dict of named terms and a dict of weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+
+def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+    """Sum of weight * term over the terms.
+
+    Raises:
+        KeyError: a term has no weight. (A weight whose term was never computed is the stage's error.)
+    """
+    return sum(weights[name] * term for name, term in terms.items())
