@@ -1,7 +1,7 @@
 """Ground truth of a clip: `gt.npz` and, beside it, the true object as `gt_object.ply`.
 
-All is in the OpenCV camera frame of its time, metres: hand vertices are LBS(pose, betas) + trans, object points
-obj_R (obj_scale x) + obj_t for x of `gt_object.ply`.
+All is in the OpenCV camera frame of its time, metres: hand vertices are LBS(pose, betas) + trans, object
+points obj_R (obj_scale x) + obj_t for x of `gt_object.ply`.
 """
 
 from __future__ import annotations

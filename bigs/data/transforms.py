@@ -1,7 +1,7 @@
 """Cameras to render from: `transforms.json` as instant-ngp and nerfstudio write it.
 
 Each frame has `frame_index`, the time of the clip to show, and `transform_matrix`, camera to world with
-OpenGL camera axes (x right, y up, looking along -z). World is the clip's camera frame of that time, OpenCV axes.
+OpenGL camera axes (x right, y up, looking along -z). World is the camera frame of that time, OpenCV axes.
 """
 
 from __future__ import annotations
