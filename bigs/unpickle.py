@@ -1,0 +1,402 @@
+"""Reading other people's pickles without running anything they ask for.
+
+A pickle is a program that may name any function. Here every name is checked against a short list, and even
+a name on the list is not what gets called: while the program runs, each call only makes an inert record of
+what was asked for. The records are turned into arrays, sparse matrices and tensors afterwards, by the code
+below, which checks types, sizes and indices. (Handing a pickle the real `numpy.dtype` is not safe: a forged
+dtype state lets raw bytes pass for object pointers.)
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import scipy.sparse
+import torch
+
+from bigs.checks import InputError
+
+Global = tuple[str, str]
+
+# The names a pickle may use, as canonical (module, qualified name) pairs; see `_canonical`.
+CONTAINERS: frozenset[Global] = frozenset(
+    {
+        ("builtins", "set"),
+        ("builtins", "frozenset"),
+        ("builtins", "object"),
+        ("builtins", "bytes"),
+        ("collections", "OrderedDict"),
+        ("copyreg", "_reconstructor"),
+        ("_codecs", "encode"),
+    }
+)
+ARRAYS: frozenset[Global] = CONTAINERS | {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy.core.numeric", "_frombuffer"),
+}
+SPARSE: frozenset[Global] = ARRAYS | {
+    (f"scipy.sparse.{kind}", f"{kind}_{form}") for kind in ("csc", "csr") for form in ("matrix", "array")
+}
+CHUMPY: frozenset[Global] = SPARSE | {("chumpy.ch", "Ch"), ("chumpy.reordering", "Select")}
+
+STORAGE_DTYPES: dict[str, np.dtype] = {
+    "DoubleStorage": np.dtype("<f8"),
+    "FloatStorage": np.dtype("<f4"),
+    "HalfStorage": np.dtype("<f2"),
+    "LongStorage": np.dtype("<i8"),
+    "IntStorage": np.dtype("<i4"),
+    "ShortStorage": np.dtype("<i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+TENSORS: frozenset[Global] = ARRAYS | {
+    ("torch", "Size"),
+    ("torch._utils", "_rebuild_tensor"),
+    ("torch._utils", "_rebuild_tensor_v2"),
+    ("torch.storage", "_load_from_bytes"),
+    *(("torch", storage) for storage in STORAGE_DTYPES),
+}
+
+_DTYPE_CODE = re.compile(r"[<>|=]?(b1|\?|[iu][1248]|f[248]|c8|c16|S\d+|U\d+|O[48]?)")
+_TORCH_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
+
+
+def restricted_load(file: BinaryIO, *, name: str, allow: frozenset[Global] = ARRAYS) -> Any:
+    """The first pickle in `file`: plain containers, numbers, strings, arrays and what `allow` adds.
+
+    Python 2 strings are decoded as latin-1. Array subclasses and structured dtypes are refused too.
+
+    Args:
+        file: open for reading, in binary mode.
+        name: what to call it in messages, usually its path.
+        allow: one of `CONTAINERS`, `ARRAYS`, `SPARSE`, `CHUMPY`, `TENSORS`, or a union of them.
+
+    Returns:
+        Containers of numpy arrays and scalars, `scipy.sparse` CSC or CSR matrices, and torch tensors; a
+        chumpy object is replaced by the array it stands for, an ordered dict by a dict.
+
+    Raises:
+        InputError: the pickle names anything else, or is damaged.
+    """
+    try:
+        return _Builder(allow).value(_RecordingUnpickler(file, allow).load())
+    except _Refused as refusal:
+        raise InputError(
+            f"{name}: expected a pickle of plain data, found the global '{refusal}', which is refused "
+            "because it could run code"
+        ) from None
+    except Exception as error:  # pickle promises no particular exception for malformed data
+        reason = str(error) or type(error).__name__
+        raise InputError(f"{name}: expected a readable pickle of plain data, found: {reason}") from error
+
+
+def load_npy(path: str | Path, *, allow: frozenset[Global] = TENSORS) -> Any:
+    """What `np.save` wrote: an array, or the object that was saved as an object array of shape ().
+
+    Raises:
+        InputError: there is no such file, or it is not an .npy file, or `restricted_load` refuses it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: expected an .npy file, found nothing")
+    with path.open("rb") as file:
+        try:
+            dtype = _npy_dtype(file)
+            if not dtype.hasobject:
+                file.seek(0)
+                return np.load(file, allow_pickle=False)
+        except Exception as error:  # the header is parsed as a literal; damage shows up in many ways
+            raise InputError(f"{path}: expected an .npy file, found: {error}") from error
+        if dtype != np.dtype(object):
+            raise InputError(f"{path}: expected an array of numbers or of objects, found dtype {dtype}")
+        array = restricted_load(file, name=str(path), allow=allow)
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{path}: expected a pickled object array, found {type(array).__name__}")
+    return array.item() if array.shape == () else array
+
+
+def _npy_dtype(file: BinaryIO) -> np.dtype:
+    """The dtype in an .npy header; leaves `file` at the first byte after the header."""
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"format version {version}")
+    return readers[version](file)[2]
+
+
+class _Refused(pickle.UnpicklingError):
+    """A global that is not on the list; the message is its name."""
+
+
+class _Record:
+    """An object as a pickle describes it: a name, arguments, and a state. Never has any behaviour."""
+
+    __slots__ = ("args", "state")
+    key: Global = ("", "")
+
+    args: tuple[Any, ...]
+    state: Any
+
+    def __new__(cls, *args: Any) -> _Record:
+        record = object.__new__(cls)
+        record.args = args
+        record.state = None
+        return record
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _PersistentId(_Record):
+    """A reference to data outside the pickle (used by torch)."""
+
+    __slots__ = ()
+    key = ("", "persistent id")
+
+
+class _DictRecord(_Record):
+    """An ordered dict; the only record that items are stored into."""
+
+    __slots__ = ("entries",)
+    entries: dict[Any, Any]
+
+    def __setitem__(self, key: Any, item: Any) -> None:
+        if not hasattr(self, "entries"):
+            self.entries = {}
+        self.entries[key] = item
+
+
+class _RecordingUnpickler(pickle.Unpickler):
+    """Runs a pickle's program with every global replaced by a record class made for this one load."""
+
+    def __init__(self, file: BinaryIO, allow: frozenset[Global], *, persistent: bool = False) -> None:
+        super().__init__(file, encoding="latin1")
+        self._allow = allow
+        self._persistent = persistent
+        self._classes: dict[Global, type[_Record]] = {}
+
+    def find_class(self, module: str, name: str) -> type[_Record]:
+        key = _canonical(module, name)
+        if key not in self._allow:
+            raise _Refused(f"{module}.{name}")
+        if key not in self._classes:
+            base = _DictRecord if key == ("collections", "OrderedDict") else _Record
+            self._classes[key] = type(name, (base,), {"__slots__": (), "key": key})
+        return self._classes[key]
+
+    def persistent_load(self, pid: Any) -> _Record:
+        if not self._persistent:
+            raise pickle.UnpicklingError("a reference to data outside the pickle")
+        return _PersistentId(pid)
+
+
+def _canonical(module: str, name: str) -> Global:
+    """One spelling for a global that Python 2, NumPy 1 and 2, and old and new SciPy spell differently."""
+    module = {"__builtin__": "builtins", "copy_reg": "copyreg", "chumpy": "chumpy.ch"}.get(module, module)
+    module = re.sub(r"^numpy\._core\b", "numpy.core", module)
+    module = re.sub(r"^scipy\.sparse\._(csc|csr)$", r"scipy.sparse.\1", module)
+    return module, name
+
+
+class _Builder:
+    """Turns records into values, depth first. Shared parts stay shared; a cycle is an error."""
+
+    def __init__(self, allow: frozenset[Global]) -> None:
+        self._allow = allow
+        self._done: dict[int, Any] = {}
+        self._active: set[int] = set()
+        # Keeps every visited object alive, so that an id in `_done` cannot come to mean another object.
+        self._alive: list[Any] = []
+
+    def value(self, raw: Any) -> Any:
+        if raw is None or type(raw) in (bool, int, float, complex, str, bytes):
+            return raw
+        if id(raw) in self._done:
+            return self._done[id(raw)]
+        if id(raw) in self._active:
+            raise ValueError("an object that contains itself")
+        self._active.add(id(raw))
+        self._alive.append(raw)
+        result = self._record(raw) if isinstance(raw, _Record) else self._container(raw)
+        self._active.discard(id(raw))
+        self._done[id(raw)] = result
+        return result
+
+    def _container(self, raw: Any) -> Any:
+        if type(raw) is dict:
+            return {self.value(key): self.value(item) for key, item in raw.items()}
+        if type(raw) in (list, tuple, set, frozenset):
+            return type(raw)([self.value(item) for item in raw])
+        if type(raw) is bytearray:
+            return bytes(raw)
+        what = ".".join(raw.key) if isinstance(raw, type) and issubclass(raw, _Record) else type(raw).__name__
+        raise TypeError(f"{what} where data should be")
+
+    def _record(self, record: _Record) -> Any:
+        if record.key == ("copyreg", "_reconstructor"):
+            state, (cls, *_) = record.state, record.args
+            if not (isinstance(cls, type) and issubclass(cls, _Record)):
+                raise TypeError("copyreg._reconstructor of something that is not a class")
+            record = cls()
+            record.state = state
+        builder = _BUILDERS.get(record.key)
+        if builder is None:
+            raise TypeError(f"{'.'.join(record.key)} where data should be")
+        return builder(self, record)
+
+    def buffer(self, raw: Any) -> bytes:
+        """The bytes of `raw`; Python 2 wrote them as a string, which came here as latin-1."""
+        data = self.value(raw)
+        if isinstance(data, str):
+            return data.encode("latin1")
+        if not isinstance(data, bytes):
+            raise TypeError(f"{type(data).__name__} where bytes should be")
+        return data
+
+    def storage(self, raw: bytes) -> torch.Tensor:
+        """A flat tensor from the stream in which `torch.save` wrote one storage before it used zip files."""
+        stream = io.BytesIO(raw)
+        magic, version, system = (_RecordingUnpickler(stream, frozenset()).load() for _ in range(3))
+        if magic != _TORCH_LEGACY_MAGIC or version != 1001 or system.get("little_endian") is not True:
+            raise ValueError("a torch storage of an unknown format")
+        reference = _RecordingUnpickler(stream, self._allow, persistent=True).load()
+        keys = _RecordingUnpickler(stream, frozenset()).load()
+        if type(reference) is not _PersistentId:
+            raise TypeError("a torch storage that is not a storage")
+        kind, storage_type, key, _location, count, *view = reference.args[0]
+        if kind != "storage" or keys != [key] or any(part is not None for part in view):
+            raise ValueError("a torch storage of an unknown kind")
+        dtype = STORAGE_DTYPES[storage_type.key[1]]
+        if int.from_bytes(stream.read(8), "little") != count:
+            raise ValueError("a torch storage of another length than announced")
+        return torch.from_numpy(_from_bytes(stream.read(count * dtype.itemsize), dtype, (count,), "C"))
+
+
+def _from_bytes(data: bytes, dtype: np.dtype, shape: tuple[int, ...], order: Any) -> np.ndarray:
+    flat = np.frombuffer(data, dtype) if data else np.empty(0, dtype)
+    return np.reshape(flat, shape, order="F" if order == "F" else "C").copy(order="K")
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    if type(value) is not tuple or not all(isinstance(n, int | np.integer) and n >= 0 for n in value):
+        raise ValueError(f"the array shape {value!r}")
+    return tuple(int(n) for n in value)
+
+
+def _build_dtype(builder: _Builder, record: _Record) -> np.dtype:
+    code = record.args[0]
+    state = builder.value(record.state) or (3, "|", None, None, None)
+    if (
+        type(code) is not str
+        or not _DTYPE_CODE.fullmatch(code)
+        or any(part is not None for part in state[2:5])
+    ):
+        raise ValueError(f"the array type {code!r}")
+    dtype = np.dtype("O" if code[:1] == "O" else code)
+    return dtype.newbyteorder(">") if state[1] == ">" else dtype
+
+
+def _build_array(builder: _Builder, record: _Record) -> np.ndarray:
+    cls = record.args[0]
+    if not (isinstance(cls, type) and issubclass(cls, _Record) and cls.key == ("numpy", "ndarray")):
+        raise TypeError("an array that is not a plain numpy.ndarray")
+    _version, raw_shape, raw_dtype, fortran, data = record.state
+    shape, dtype = _shape(builder.value(raw_shape)), builder.value(raw_dtype)
+    if dtype != np.dtype(object):
+        return _from_bytes(builder.buffer(data), dtype, shape, "F" if fortran else "C")
+    items = builder.value(data)
+    array = np.empty(len(items), object)
+    for index, item in enumerate(items):
+        array[index] = item
+    return np.reshape(array, shape, order="F" if fortran else "C")
+
+
+def _build_array_from_buffer(builder: _Builder, record: _Record) -> np.ndarray:
+    data, raw_dtype, raw_shape, order, *axes = record.args
+    dtype, shape = builder.value(raw_dtype), _shape(builder.value(raw_shape))
+    array = _from_bytes(builder.buffer(data), dtype, shape, order)
+    return array.transpose(builder.value(axes[0])) if order == "K" and axes else array
+
+
+def _build_scalar(builder: _Builder, record: _Record) -> Any:
+    dtype, data = builder.value(record.args[0]), builder.buffer(record.args[1])
+    return _from_bytes(data, dtype, (), "C")[()]
+
+
+def _build_sparse(builder: _Builder, record: _Record) -> Any:
+    state = builder.value(record.state)
+    matrix_type = getattr(scipy.sparse, record.key[1])
+    parts = tuple(np.asarray(state[part]) for part in ("data", "indices", "indptr"))
+    matrix = matrix_type(parts, shape=_shape(state["_shape"] if "_shape" in state else state["shape"]))
+    # SciPy's compiled loops trust the indices; this is what looks at every one of them.
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _build_chumpy(builder: _Builder, record: _Record) -> np.ndarray:
+    """A `Ch` holds its array as `x`; a `Select` takes `idxs` of `a`, flattened, into `preferred_shape`."""
+    state = record.state
+    if record.key[1] == "Ch":
+        return np.asarray(builder.value(state["x"]))
+    source = np.asarray(builder.value(state["a"]))
+    picked = source.ravel()[np.asarray(builder.value(state["idxs"]))]
+    return picked.reshape(builder.value(state["preferred_shape"])) if "preferred_shape" in state else picked
+
+
+def _build_tensor(builder: _Builder, record: _Record) -> torch.Tensor:
+    storage, offset, size, stride = (builder.value(part) for part in record.args[:4])
+    if not isinstance(storage, torch.Tensor):
+        raise TypeError("a torch tensor without a storage")
+    size, stride = _shape(size), _shape(stride)
+    # A stride of 0 could announce a tensor far larger than the file that holds it.
+    if math.prod(size) > storage.numel():
+        raise ValueError(f"a torch tensor of size {list(size)} in a storage of {storage.numel()} values")
+    return storage.as_strided(size, stride, offset).clone()
+
+
+def _build_from_iterable(make: type) -> Callable[[_Builder, _Record], Any]:
+    return lambda builder, record: make(*(builder.value(arg) for arg in record.args[:1]))
+
+
+def _build_dict(builder: _Builder, record: _Record) -> dict[Any, Any]:
+    given = dict(builder.value(record.args[0])) if record.args else {}
+    return given | builder.value(getattr(record, "entries", {}))
+
+
+def _build_encoded(builder: _Builder, record: _Record) -> bytes:
+    """Python 3 writes bytes as `codecs.encode(text, "latin1")` in the protocols that Python 2 can read."""
+    if record.args[1:] not in (("latin1",), ("latin-1",)):
+        raise ValueError(f"the text encoding {record.args[1:]!r}")
+    return builder.value(record.args[0]).encode("latin1")
+
+
+_BUILDERS: dict[Global, Callable[[_Builder, _Record], Any]] = {
+    ("builtins", "set"): _build_from_iterable(set),
+    ("builtins", "frozenset"): _build_from_iterable(frozenset),
+    ("builtins", "bytes"): lambda builder, record: builder.buffer(record.args[0]) if record.args else b"",
+    ("_codecs", "encode"): _build_encoded,
+    ("numpy", "dtype"): _build_dtype,
+    ("numpy.core.multiarray", "_reconstruct"): _build_array,
+    ("numpy.core.multiarray", "scalar"): _build_scalar,
+    ("numpy.core.numeric", "_frombuffer"): _build_array_from_buffer,
+    **dict.fromkeys(SPARSE - ARRAYS, _build_sparse),
+    **dict.fromkeys(CHUMPY - SPARSE, _build_chumpy),
+    ("torch", "Size"): _build_from_iterable(tuple),
+    ("torch._utils", "_rebuild_tensor"): _build_tensor,
+    ("torch._utils", "_rebuild_tensor_v2"): _build_tensor,
+    ("collections", "OrderedDict"): _build_dict,
+    ("torch.storage", "_load_from_bytes"): lambda builder, record: builder.storage(
+        builder.buffer(record.args[0])
+    ),
+}
