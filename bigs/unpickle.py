@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import pickletools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -90,7 +91,7 @@ def restricted_load(file: BinaryIO, *, name: str, allow: frozenset[Global] = ARR
         InputError: the pickle names anything else, or is damaged.
     """
     try:
-        return _Builder(allow).value(_RecordingUnpickler(file, allow).load())
+        return _Builder(allow).value(_load_records(io.BytesIO(file.read()), allow))
     except _Refused as refusal:
         raise InputError(
             f"{name}: expected a pickle of plain data, found the global '{refusal}', which is refused "
@@ -201,6 +202,18 @@ class _RecordingUnpickler(pickle.Unpickler):
         return _PersistentId(pid)
 
 
+def _load_records(stream: io.BytesIO, allow: frozenset[Global], *, persistent: bool = False) -> Any:
+    """The next pickle in `stream` with every global call left as a record."""
+    start = stream.tell()
+    # A few forged bytes can make the unpickler allocate gigabytes: a length beyond the end of the data (which
+    # this walk over the program notices by itself), or a memo slot that no program of this size would reach.
+    for count, (opcode, argument, _position) in enumerate(pickletools.genops(stream)):
+        if opcode.name.endswith("PUT") and argument > count:
+            raise ValueError(f"memo slot {argument} after {count} instructions")
+    stream.seek(start)
+    return _RecordingUnpickler(stream, allow, persistent=persistent).load()
+
+
 def _canonical(module: str, name: str) -> Global:
     """One spelling for a global that Python 2, NumPy 1 and 2, and old and new SciPy spell differently."""
     module = {"__builtin__": "builtins", "copy_reg": "copyreg", "chumpy": "chumpy.ch"}.get(module, module)
@@ -267,11 +280,11 @@ class _Builder:
     def storage(self, raw: bytes) -> torch.Tensor:
         """A flat tensor from the stream in which `torch.save` wrote one storage before it used zip files."""
         stream = io.BytesIO(raw)
-        magic, version, system = (_RecordingUnpickler(stream, frozenset()).load() for _ in range(3))
+        magic, version, system = (_load_records(stream, frozenset()) for _ in range(3))
         if magic != _TORCH_LEGACY_MAGIC or version != 1001 or system.get("little_endian") is not True:
             raise ValueError("a torch storage of an unknown format")
-        reference = _RecordingUnpickler(stream, self._allow, persistent=True).load()
-        keys = _RecordingUnpickler(stream, frozenset()).load()
+        reference = _load_records(stream, self._allow, persistent=True)
+        keys = _load_records(stream, frozenset())
         if type(reference) is not _PersistentId:
             raise TypeError("a torch storage that is not a storage")
         kind, storage_type, key, _location, count, *view = reference.args[0]
