@@ -19,12 +19,12 @@ from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
-from bigs.data._stopgap import load_npy
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, list_frames, read_image, read_mask
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.types import ENTITIES, MASK_VALUES, SIDES, Entity, Side
+from bigs.unpickle import load_npy
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 
