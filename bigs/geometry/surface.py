@@ -1,7 +1,8 @@
 """An object's surface from its silhouettes and a sparse point cloud, as a signed distance on a grid.
 
-The visual hull is right where the object is convex and wrong in hollows; points with normals are right where
-there are points. The two are blended by the distance to the nearest point.
+The visual hull is right where the object is convex and wrong in hollows and where a hand always hid the
+background; points with normals are right where there are points. The two are blended by the distance to the
+nearest point, and the hull is cut back to the points' convex hull where nothing speaks for it.
 """
 
 from __future__ import annotations
@@ -48,36 +49,72 @@ def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
     return (np.where(allowed, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 
-def hull_distance(
-    points: np.ndarray, allowed: np.ndarray, K: np.ndarray, rotations: np.ndarray, centers: np.ndarray
-) -> np.ndarray:
-    """Distance of points to the visual hull: the largest over frames of the distance to the silhouette's cone.
+@dataclass(frozen=True)
+class VisualHull:
+    """Silhouettes and the poses they were seen from."""
 
-    Args:
-        points: [N, 3] metres, object frame.
-        allowed: [T, H, W] bool, where the object may be: its own pixels and those of whatever may hide it.
-        K: [3, 3] intrinsics of those masks.
-        rotations: [T, 3, 3]; x_cam = R x + centre.
-        centers: [T, 3].
+    silhouettes: np.ndarray  # [T, H, W] signed distances in pixels, negative where the object may be
+    K: np.ndarray  # [3, 3] intrinsics
+    rotations: np.ndarray  # [T, 3, 3]; x_cam = R x + centre
+    centers: np.ndarray  # [T, 3] metres
 
-    Returns:
-        [N] metres, negative inside; a lower bound of the true distance outside. A point that no frame
-        sees counts as inside by a large amount.
-    """
-    height, width = allowed.shape[1:]
+    def distance(self, points: np.ndarray, stop: float = np.inf) -> np.ndarray:
+        """Distance of points [N, 3] to the hull: the largest over frames of that to the silhouette's cone.
+
+        Args:
+            points: metres, object frame.
+            stop: points found to be further outside than this are not looked at again.
+
+        Returns:
+            [N] metres, negative inside; a lower bound of the true distance outside. A point that no frame
+            sees counts as inside by a large amount.
+        """
+        height, width = self.silhouettes.shape[1:]
+        largest = np.full(len(points), -np.inf)
+        active = np.arange(len(points))
+        for silhouette, rotation, center in zip(self.silhouettes, self.rotations, self.centers, strict=True):
+            cam = points[active] @ rotation.T + center
+            u, v = self._pixels(cam)
+            seen = (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
+            pixels = scipy.ndimage.map_coordinates(
+                silhouette, np.stack([v[seen], u[seen]]), order=1, prefilter=False
+            )
+            index = active[seen]
+            largest[index] = np.maximum(largest[index], pixels * cam[seen, 2] / self.K[0, 0])
+            active = active[largest[active] <= stop]
+        return np.where(np.isfinite(largest), largest, -1.0)
+
+    def share_seen(self, points: np.ndarray, masks: np.ndarray) -> np.ndarray:
+        """In what share [N] of the frames each point falls on a true pixel of `masks` [T, H, W] (bool)."""
+        height, width = masks.shape[1:]
+        count = np.zeros(len(points))
+        for mask, rotation, center in zip(masks, self.rotations, self.centers, strict=True):
+            u, v = self._pixels(points @ rotation.T + center)
+            column, row = np.rint(u), np.rint(v)
+            inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+            count[inside] += mask[row[inside].astype(int), column[inside].astype(int)]
+        return count / len(masks)
+
+    def _pixels(self, cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Array coordinates (column, row) of camera points [N, 3]; NaN on and behind the camera."""
+        depth = np.where(cam[:, 2] > 1e-3, cam[:, 2], np.nan)
+        u = self.K[0, 0] * cam[:, 0] / depth + self.K[0, 2] - 0.5
+        return u, self.K[1, 1] * cam[:, 1] / depth + self.K[1, 2] - 0.5
+
+    def outward(self, points: np.ndarray, step: float) -> np.ndarray:
+        """Directions [N, 3] in which the hull's distance grows, by central differences of `step` metres."""
+        slopes = [self.distance(points + step * axis) - self.distance(points - step * axis) for axis in np.eye(3)]
+        # The slope is exactly zero deep inside; there the direction from the middle decides.
+        away = points - points.mean(0)
+        return np.stack(slopes, axis=-1) + 1e-3 * away / np.linalg.norm(away, axis=-1, keepdims=True).clip(1e-9)
+
+
+def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """Distance [N] of points to the convex hull of `cloud` [M, 3]: the largest over its faces; negative inside."""
     largest = np.full(len(points), -np.inf)
-    for mask, rotation, center in zip(allowed, rotations, centers, strict=True):
-        cam = points @ rotation.T + center
-        depth = cam[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = K[0, 0] * cam[:, 0] / depth + K[0, 2] - 0.5
-            v = K[1, 1] * cam[:, 1] / depth + K[1, 2] - 0.5
-        seen = (depth > 1e-3) & (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
-        pixels = scipy.ndimage.map_coordinates(
-            silhouette_distance(mask), np.stack([v[seen], u[seen]]), order=1, prefilter=False
-        )
-        largest[seen] = np.maximum(largest[seen], pixels * depth[seen] / K[0, 0])
-    return np.where(np.isfinite(largest), largest, -1.0)
+    for equation in scipy.spatial.ConvexHull(cloud).equations:
+        np.maximum(largest, points @ equation[:3] + equation[3], out=largest)
+    return largest
 
 
 def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12) -> np.ndarray:

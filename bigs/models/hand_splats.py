@@ -173,9 +173,14 @@ def pose_hand(
     points = hand.points + hand.shapedirs @ betas
     if hand.posedirs is not None:
         points = points + pose_corrective(hand.posedirs, frames.hand_pose)
+    return skin_hand(hand, points, bones, side)
+
+
+def skin_hand(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) -> Gaussians:
+    """Carry shaped rest points [N, 3] or [B, N, 3] along the bones [B, 16, 4, 4] of B frames."""
     means = skin_points(points, hand.weights, bones)
     if hand.quats is None:
-        quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(points), 4)
+        quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(hand.scales), 4)
     else:
         quats = quat_multiply(blend_quats(hand.weights, bones), hand.quats)
     if side == "left":

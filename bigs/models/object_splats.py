@@ -25,8 +25,6 @@ class ObjectSplatsConfig:
     decoders: DecoderConfig = DecoderConfig()
     # Gaussians at the start, spread evenly over the initial surface; the paper starts from at least 10000.
     n_gaussians: int = 6000
-    # Upper limit for densification.
-    max_gaussians: int = 50_000
     scale_per_spacing: float = 0.6
     flatness: float = 0.35
     opacity: float = 0.95
@@ -94,8 +92,9 @@ class ObjectSplats(nn.Module):
             self.normals,
         )
 
-    def pose(self, obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:
-        """Carry the canonical Gaussians to B frames, in camera space."""
-        means = frames.scale * obj.means @ frames.rotations.transpose(-1, -2) + frames.centers[:, None]
-        quats = quat_multiply(matrix_to_quat(frames.rotations)[:, None], obj.quats)
-        return Gaussians(means, quats, frames.scale * obj.scales, obj.opacities, obj.colors)
+
+def pose_object(obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:
+    """Carry the canonical Gaussians to B frames, in camera space."""
+    means = frames.scale * obj.means @ frames.rotations.transpose(-1, -2) + frames.centers[:, None]
+    quats = quat_multiply(matrix_to_quat(frames.rotations)[:, None], obj.quats)
+    return Gaussians(means, quats, frames.scale * obj.scales, obj.opacities, obj.colors)

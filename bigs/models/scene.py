@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
 from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_hand
-from bigs.models.object_splats import CanonicalObject, ObjectSplats
+from bigs.models.object_splats import CanonicalObject, ObjectSplats, pose_object
 from bigs.models.poses import HandFrames, HandPoses, ObjectFrames, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
 
@@ -114,7 +114,7 @@ class Scene(nn.Module):
     ) -> Gaussians:
         """Gaussians of one entity at `frames` [B], camera space: means [B, N, 3], quats [B, N, 4]."""
         if entity == "object":
-            return self.object_splats.pose(canonical, self.object_frames(frames))
+            return pose_object(canonical, self.object_frames(frames))
         return pose_hand(
             self.hand_model(entity),
             canonical,

@@ -1,0 +1,205 @@
+"""A finished reconstruction as plain tensors: any frame can be shown without the clip or the hand model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from bigs.checks import InputError
+from bigs.export.atomic import atomic_write
+from bigs.hand.lbs import pose_corrective
+from bigs.models.hand_splats import CanonicalHand, skin_hand
+from bigs.models.object_splats import CanonicalObject, pose_object
+from bigs.models.poses import ObjectFrames
+from bigs.models.scene import Scene, concatenate
+from bigs.types import SIDES, Entity, Gaussians, HandObjectTrajectory, Side
+
+FORMAT = "bigs-scene-1"
+
+
+@dataclass(frozen=True)
+class HandPlayback:
+    """One hand over the clip."""
+
+    joints: Tensor  # [T, 21, 3] camera space, metres
+    verts: Tensor  # [T, V, 3]
+    faces: Tensor  # [F, 3]
+    bones: Tensor  # [T, 16, 4, 4] of the canonical (right) hand, mirrored camera for a left hand
+    hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
+    splats: CanonicalHand  # points already in the clip's shape
+
+
+@dataclass(frozen=True)
+class ObjectPlayback:
+    """The object over the clip: x_cam = scale * R x + centre."""
+
+    rotations: Tensor  # [T, 3, 3]
+    centers: Tensor  # [T, 3]
+    scale: Tensor  # []
+    verts: Tensor  # [V, 3] own frame, metres at the initial size
+    faces: Tensor  # [F, 3]
+    splats: CanonicalObject
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Everything a renderer or an exporter needs."""
+
+    name: str
+    frame_names: tuple[str, ...]
+    K: Tensor  # [3, 3]
+    width: int
+    height: int
+    normalize_shift: tuple[float, float, float]  # of the clip's file; places HOLD's scaled space
+    hands: dict[Side, HandPlayback]
+    object: ObjectPlayback | None
+
+    @property
+    def entities(self) -> tuple[Entity, ...]:
+        return (*self.hands, "object") if self.object is not None else tuple(self.hands)
+
+    def __len__(self) -> int:
+        return len(self.frame_names)
+
+    def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
+        """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], colours [N, 3]."""
+        index = torch.as_tensor(list(frames))
+        return concatenate(
+            self._posed(entity, index) for entity in (self.entities if entities is None else entities)
+        )
+
+    def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
+        if entity == "object":
+            obj = self.object
+            return pose_object(obj.splats, ObjectFrames(obj.rotations[index], obj.centers[index], obj.scale))
+        hand = self.hands[entity]
+        points = hand.splats.points
+        if hand.splats.posedirs is not None:
+            points = points + pose_corrective(hand.splats.posedirs, hand.hand_pose[index])
+        return skin_hand(hand.splats, points, hand.bones[index], entity)
+
+    def trajectory(self) -> HandObjectTrajectory:
+        """Meshes and joints of every frame, camera space, metres."""
+        verts = None
+        if self.object is not None:
+            obj = self.object
+            verts = (obj.scale * obj.verts @ obj.rotations.transpose(-1, -2) + obj.centers[:, None]).numpy()
+        return HandObjectTrajectory(
+            name=self.name,
+            frame_names=self.frame_names,
+            joints={side: hand.joints.numpy() for side, hand in self.hands.items()},
+            verts={side: hand.verts.numpy() for side, hand in self.hands.items()},
+            faces={side: hand.faces.numpy() for side, hand in self.hands.items()},
+            object_verts=verts,
+            object_faces=None if self.object is None else self.object.faces.numpy(),
+        )
+
+
+@torch.no_grad()
+def record(
+    scene: Scene, name: str, frame_names: tuple[str, ...], normalize_shift: tuple[float, float, float]
+) -> Playback:
+    """Evaluate a scene once and keep what is needed to show it."""
+    frames = torch.arange(scene.n_frames)
+    canonical = scene.canonical(scene.entities)
+    hands: dict[Side, HandPlayback] = {}
+    for side in scene.sides:
+        model, betas = scene.hand_model(side), scene.hand_betas(side)
+        pose = scene.hand_frames(side, frames)
+        verts, joints = scene.hand_points(side, frames)
+        splats = canonical[side]
+        hands[side] = HandPlayback(
+            joints,
+            verts,
+            model.faces if side == "right" else model.faces.flip(-1),
+            model(betas, pose.hand_pose, pose.global_orient, pose.wrist).bone_transforms,
+            pose.hand_pose,
+            splats._replace(
+                points=splats.points + splats.shapedirs @ betas, shapedirs=splats.shapedirs[..., :0]
+            ),
+        )
+    obj = None
+    if scene.object_splats is not None:
+        pose = scene.object_frames(frames)
+        surface = scene.object_surface
+        obj = ObjectPlayback(
+            pose.rotations, pose.centers, pose.scale, surface.verts, surface.faces, canonical["object"]
+        )
+    return Playback(
+        name, frame_names, scene.K, scene.width, scene.height, tuple(map(float, normalize_shift)), hands, obj
+    )
+
+
+def save_playback(path: Path, playback: Playback) -> None:
+    """Write a playback as one safetensors file."""
+    tensors: dict[str, Tensor] = {"K": playback.K}
+    for side, hand in playback.hands.items():
+        named = {key: getattr(hand, key) for key in ("joints", "verts", "faces", "bones", "hand_pose")}
+        named |= {f"splats.{key}": value for key, value in hand.splats._asdict().items() if value is not None}
+        tensors |= {f"{side}.{key}": value for key, value in named.items()}
+    if playback.object is not None:
+        obj = playback.object
+        named = {key: getattr(obj, key) for key in ("rotations", "centers", "scale", "verts", "faces")}
+        named |= {f"splats.{key}": value for key, value in obj.splats._asdict().items()}
+        tensors |= {f"object.{key}": value for key, value in named.items()}
+    metadata = {
+        "format": FORMAT,
+        "name": playback.name,
+        "frame_names": json.dumps(playback.frame_names),
+        "size": json.dumps([playback.width, playback.height]),
+        "normalize_shift": json.dumps(playback.normalize_shift),
+    }
+    # Shared storage (one canonical hand for two sides) is written twice: a reader then needs no special case.
+    with atomic_write(path) as file:
+        file.write(save({key: value.contiguous().clone() for key, value in tensors.items()}, metadata))
+
+
+def load_playback(path: Path) -> Playback:
+    """Read what `save_playback` wrote.
+
+    Raises:
+        InputError: missing, damaged or of another format.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected a finished run's scene, found no such file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: expected format {FORMAT}, found {metadata.get('format')}")
+
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {key.removeprefix(prefix): v for key, v in tensors.items() if key.startswith(prefix)}
+
+    hands: dict[Side, HandPlayback] = {}
+    for side in SIDES:
+        splats = part(f"{side}.splats.")
+        if splats:
+            fields = {key: splats.get(key) for key in CanonicalHand._fields}
+            rest = {k: v for k, v in part(f"{side}.").items() if not k.startswith("splats.")}
+            hands[side] = HandPlayback(**rest, splats=CanonicalHand(**fields))
+    obj = None
+    if "object.verts" in tensors:
+        rest = {k: v for k, v in part("object.").items() if not k.startswith("splats.")}
+        obj = ObjectPlayback(**rest, splats=CanonicalObject(**part("object.splats.")))
+    width, height = json.loads(metadata["size"])
+    return Playback(
+        metadata["name"],
+        tuple(json.loads(metadata["frame_names"])),
+        tensors["K"],
+        width,
+        height,
+        tuple(json.loads(metadata["normalize_shift"])),
+        hands,
+        obj,
+    )

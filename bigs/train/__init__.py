@@ -1,0 +1,1 @@
+"""From a loaded clip to a fitted scene: start values, targets, stages, the loop and its checkpoints."""

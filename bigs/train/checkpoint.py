@@ -1,0 +1,87 @@
+"""Checkpoints: scene, optimiser and position in the plan in one safetensors file, replaced atomically."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from bigs.checks import InputError
+from bigs.export.atomic import atomic_write
+from bigs.models.scene import Scene
+from bigs.train.loop import StageState
+
+FORMAT = "bigs-checkpoint-1"
+FILE_NAME = "latest.safetensors"
+
+
+class Position(NamedTuple):
+    """Where to continue."""
+
+    stage: int  # index of the stage to run next, or to continue
+    resume: dict[str, Any] | None  # for `loop.run_stage`; None at a stage's start
+
+
+def save_checkpoint(
+    folder: Path, scene: Scene, digest: str, stage: int, state: StageState | None
+) -> None:
+    """Write the state after `state.step` steps of `stage`, or before its first when `state` is None.
+
+    Args:
+        folder: made if missing.
+        scene: the scene.
+        digest: identifies clip, configuration and version; a checkpoint of another run is refused.
+        stage: index in the plan.
+        state: what `run_stage` passes to its hook.
+    """
+    tensors = {f"scene.{name}": value for name, value in scene.state_dict().items()}
+    position: dict[str, Any] = {"stage": stage, "step": None}
+    if state is not None:
+        position |= {key: getattr(state, key) for key in ("step", "best", "best_step", "smoothed")}
+        for index, moments in state.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
+    metadata = {"format": FORMAT, "digest": digest, "position": json.dumps(position)}
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(folder / FILE_NAME) as file:
+        file.write(save({name: value.contiguous() for name, value in tensors.items()}, metadata))
+
+
+def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
+    """Restore `scene` and say where to continue; None when there is no checkpoint.
+
+    Raises:
+        InputError: the file is damaged, or belongs to another clip, configuration or version.
+    """
+    path = folder / FILE_NAME
+    if not path.exists():
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: expected a checkpoint, found a damaged file ({error})") from error
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: expected format {FORMAT}, found {metadata.get('format')}")
+    if metadata.get("digest") != digest:
+        raise InputError(
+            f"{path}: expected a checkpoint of this clip, hand model, configuration and version, "
+            f"found one of another run (digest {metadata.get('digest')} instead of {digest})"
+        )
+    scene.load_state_dict(
+        {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
+    )
+    position = json.loads(metadata["position"])
+    if position["step"] is None:
+        return Position(position["stage"], None)
+    moments: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimizer."):
+            _, index, key = name.split(".")
+            moments.setdefault(int(index), {})[key] = value
+    resume = {key: position[key] for key in ("step", "best", "best_step", "smoothed")}
+    return Position(position["stage"], resume | {"moments": moments})

@@ -1,0 +1,66 @@
+"""The configuration of a run: frozen values that travel once, downward. Presets are in `presets.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bigs.models.hand_splats import HandSplatsConfig
+from bigs.models.object_splats import ObjectSplatsConfig
+from bigs.raster.settings import RasterSettings
+from bigs.train.initial import InitialConfig
+
+Step = Literal["single-subject", "interacting-subjects"]
+
+
+@dataclass(frozen=True)
+class OptimizeStage:
+    """One stretch of gradient descent: what may move, what it is asked to satisfy, and for how long."""
+
+    name: str
+    # The paper's two steps: every subject rendered alone, or all together.
+    step: Step
+    steps: int
+    # Trainable groups (see `optim.GROUPS`) and their learning rates; a group that is not listed is frozen.
+    lrs: dict[str, float]
+    # Loss terms (see `terms.TERMS`) and their weights; a term that is not listed is not computed.
+    weights: dict[str, float]
+    # Size of the images of this stage relative to the clip's.
+    image_scale: float = 1.0
+    # How many frames share one evaluation of the canonical fields; 0 takes the whole clip.
+    frames_per_step: int = 0
+    # Learning rates fall along a cosine to this share.
+    final_lr: float = 0.1
+    # Stop when the smoothed loss has not fallen by `stop_gain` (relative) within `stop_patience` steps; 0: never.
+    stop_patience: int = 0
+    stop_gain: float = 0.002
+
+
+@dataclass(frozen=True)
+class ScaleSearchStage:
+    """The object's size by a one-dimensional search: where do the touching hands touch?"""
+
+    name: str = "object-scale-search"
+    step: Step = "interacting-subjects"
+    # Relative sizes tried: `candidates` values evenly in 1 - span ... 1 + span.
+    span: float = 0.14
+    candidates: int = 29
+
+
+Stage = OptimizeStage | ScaleSearchStage
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides the result of a run, apart from the clip and the hand model."""
+
+    seed: int = 0
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    hand: HandSplatsConfig = field(default_factory=HandSplatsConfig)
+    object: ObjectSplatsConfig = field(default_factory=ObjectSplatsConfig)
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
+    contact: Literal["center", "surface"] = "surface"
+    stages: tuple[Stage, ...] = ()
+    # Steps between checkpoints within a stage; a stage's end is always saved.
+    checkpoint_every: int = 100

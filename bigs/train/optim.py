@@ -1,0 +1,88 @@
+"""Trainable groups by name, and the optimiser over those that a stage lists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import nn
+
+from bigs.checks import InputError
+from bigs.models.scene import Scene
+
+# Group name -> where its parameters are, below a hand's or the object's modules.
+_HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
+_OBJECT_FIELD = ("triplane", "appearance", "geometry")
+GROUPS = (
+    *(f"hand.{name}" for name in (*_HAND_FIELD, "betas", "orient", "pose", "pose_bias", "ray", "depth")),
+    *(f"object.{name}" for name in (*_OBJECT_FIELD, "orient", "ray", "depth", "scale")),
+)
+FIELD_GROUPS = {
+    "hand": tuple(f"hand.{name}" for name in _HAND_FIELD),
+    "object": tuple(f"object.{name}" for name in _OBJECT_FIELD),
+}
+
+
+def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
+    """The parameters of a group; empty when the clip lacks the subject.
+
+    Raises:
+        InputError: there is no such group.
+    """
+    if group not in GROUPS:
+        raise InputError(f"stage lrs: expected groups out of {', '.join(GROUPS)}, found {group!r}")
+    subject, name = group.split(".")
+    if subject == "hand":
+        if name in _HAND_FIELD:
+            owners = [
+                splats.color_logit if name == "color" else getattr(splats, name)
+                for splats in scene.hand_splats.values()
+            ]
+        elif name == "betas":
+            owners = list(scene.betas.values())
+        else:
+            owners = [_pose_parameter(poses, name) for poses in scene.hand_poses.values()]
+    elif scene.object_splats is None:
+        owners = []
+    elif name in _OBJECT_FIELD:
+        owners = [getattr(scene.object_splats, name)]
+    else:
+        owners = [
+            scene.object_poses.log_scale if name == "scale" else _pose_parameter(scene.object_poses, name)
+        ]
+    return [p for owner in owners for p in _parameters(owner)]
+
+
+def _pose_parameter(poses: nn.Module, name: str) -> nn.Parameter:
+    if name in ("ray", "depth"):
+        return poses.position.ray if name == "ray" else poses.position.log_depth
+    return getattr(poses, name)
+
+
+def _parameters(owner: nn.Module | nn.Parameter) -> Iterable[nn.Parameter]:
+    return [owner] if isinstance(owner, nn.Parameter) else owner.parameters()
+
+
+def make_optimizer(scene: Scene, lrs: Mapping[str, float]) -> torch.optim.Adam:
+    """Adam over the listed groups; everything else is set not to require a gradient.
+
+    The second moment's decay of 0.99 suits stages of hundreds of steps, where 0.999 would still remember
+    the first.
+    """
+    scene.requires_grad_(False)
+    groups = []
+    for name, lr in lrs.items():
+        parameters = group_parameters(scene, name)
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+        if parameters:
+            groups.append({"params": parameters, "lr": lr, "start_lr": lr, "name": name})
+    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+
+def set_cosine_rates(optimizer: torch.optim.Optimizer, progress: float, final: float) -> None:
+    """Set every group's rate for `progress` in [0, 1]: from its start down to `final` times that."""
+    factor = final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress))
+    for group in optimizer.param_groups:
+        group["lr"] = group["start_lr"] * factor
