@@ -1,0 +1,245 @@
+"""The one call: checks what it is given, picks a backend."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from bigs.checks import InputError, check_choice, check_finite, check_shape
+from bigs.raster import rust
+from bigs.raster.settings import RasterSettings
+from bigs.types import RenderOutput
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+Backend = Literal["auto", "rust", "torch", "gsplat"]
+
+# A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
+_SINGULAR = 1e-9
+
+
+def rasterization(
+    means: torch.Tensor,  # [..., N, 3]
+    quats: torch.Tensor,  # [..., N, 4]
+    scales: torch.Tensor,  # [..., N, 3]
+    opacities: torch.Tensor,  # [..., N]
+    colors: torch.Tensor,  # [..., N, D] or [..., C, N, D]
+    viewmats: torch.Tensor,  # [..., C, 4, 4]
+    Ks: torch.Tensor,  # [..., C, 3, 3]
+    width: int,
+    height: int,
+    *,
+    settings: RasterSettings | None = None,
+    backgrounds: torch.Tensor | None = None,  # [..., C, D]
+    pixel_mask: torch.Tensor | None = None,  # [..., C, H, W]
+    render_mode: RenderMode = "RGB",
+    backend: Backend = "auto",
+) -> RenderOutput:
+    """Render 3D Gaussians (paper Eq. 1 and 2) into C cameras, differentiably.
+
+    Names, shapes and rules are gsplat's. Leading batch axes "..." broadcast: an input without them, or of size 1
+    along all of them, is shared by all batch entries without being copied, and its gradient is the sum over them.
+    Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds; Ks gets none. The result is the
+    same, bit for bit, for any number of threads (`RAYON_NUM_THREADS`). Call it in the main process only: a forked
+    worker has no threads.
+
+    Args:
+        means: centres in the world, metres.
+        quats: rotations w x y z, of any length; the zero quaternion is no rotation.
+        scales: standard deviations along the rotated axes, metres.
+        opacities: in [0, 1].
+        colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too.
+        viewmats: world to camera, OpenCV axes; the 3×3 part must be invertible.
+        Ks: pinhole matrices in pixels without skew; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+        width: of the images, pixels.
+        height: of the images, pixels.
+        settings: every threshold; gsplat's values by default.
+        backgrounds: the colour behind everything; black by default. Depth has none.
+        pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the background
+            with alpha 0.
+        render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or colours and depth.
+        backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors, gsplat for
+            CUDA tensors.
+
+    Returns:
+        Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1], and info:
+        means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N], n_isects, counters.
+
+    Raises:
+        InputError: a shape, dtype, value or camera that cannot be rendered.
+    """
+    settings = RasterSettings() if settings is None else settings
+    check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
+    check_choice("backend", backend, ("auto", "rust", "torch", "gsplat"))
+    tensors: dict[str, torch.Tensor | None] = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "backgrounds": backgrounds,
+    }
+    _check_kind(tensors, pixel_mask)
+    batch = _batch_of(tensors, pixel_mask, width, height)
+    _check_cameras(viewmats, Ks)
+    if backend == "auto":
+        backend = "gsplat" if means.is_cuda else "rust"
+    if backend == "rust":
+        if means.is_cuda:
+            raise InputError("means: expected CPU tensors for backend 'rust', found a CUDA tensor")
+        return _render_rust(tensors, pixel_mask, batch, settings, render_mode)
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            check_finite(name, tensor)
+    raise InputError(f"backend: '{backend}' is not available")
+
+
+class _Batch(NamedTuple):
+    """Sizes that the inputs agree on."""
+
+    shape: tuple[int, ...]  # the "..." axes together
+    cameras: int
+    width: int
+    height: int
+    colors_per_camera: bool
+
+
+def _check_kind(tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tensor | None) -> None:
+    means = tensors["means"]
+    for name, tensor in tensors.items():
+        if tensor is None and name == "backgrounds":
+            continue
+        if not isinstance(tensor, torch.Tensor):
+            raise InputError(f"{name}: expected a torch tensor, found {type(tensor).__name__}")
+        if tensor.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"{name}: expected dtype float32 or float64, found {tensor.dtype}")
+        if tensor.dtype != means.dtype:
+            raise InputError(f"{name}: expected the dtype of means, {means.dtype}, found {tensor.dtype}")
+        if tensor.device != means.device:
+            raise InputError(f"{name}: expected the device of means, {means.device}, found {tensor.device}")
+    if pixel_mask is not None:
+        if not isinstance(pixel_mask, torch.Tensor) or pixel_mask.dtype != torch.bool:
+            found = getattr(pixel_mask, "dtype", type(pixel_mask).__name__)
+            raise InputError(f"pixel_mask: expected a bool tensor, found {found}")
+        if pixel_mask.device != means.device:
+            raise InputError(f"pixel_mask: expected the device of means, {means.device}, found {pixel_mask.device}")
+
+
+def _batch_of(
+    tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tensor | None, width: int, height: int
+) -> _Batch:
+    for name, size in (("width", width), ("height", height)):
+        if not isinstance(size, int | np.integer) or size < 1:
+            raise InputError(f"{name}: expected a positive whole number of pixels, found {size!r}")
+    n = tensors["means"].shape[-2] if tensors["means"].ndim >= 2 else "N"
+    cameras = tensors["viewmats"].shape[-3] if tensors["viewmats"].ndim >= 3 else "C"
+    channels = tensors["colors"].shape[-1] if tensors["colors"].ndim >= 2 else "D"
+    trailing: dict[str, tuple[int | str, ...]] = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "scales": (n, 3),
+        "opacities": (n,),
+        "colors": (n, channels),
+        "viewmats": (cameras, 4, 4),
+        "Ks": (cameras, 3, 3),
+        "backgrounds": (cameras, channels),
+        "pixel_mask": (cameras, height, width),
+    }
+    leading: dict[str, tuple[int, ...]] = {}
+    for name, tensor in {**tensors, "pixel_mask": pixel_mask}.items():
+        if tensor is None:
+            continue
+        expected = trailing[name]
+        found = tuple(tensor.shape[max(tensor.ndim - len(expected), 0) :])
+        if len(found) < len(expected) or any(isinstance(e, int) and e != f for e, f in zip(expected, found)):
+            shown = ", ".join(map(str, ("...", *expected)))
+            raise InputError(f"{name}: expected shape [{shown}], found {list(tensor.shape)}")
+        leading[name] = tuple(tensor.shape[: tensor.ndim - len(expected)])
+    if channels == 0 or cameras == 0:
+        name = "colors" if channels == 0 else "viewmats"
+        raise InputError(f"{name}: expected at least one, found shape {list(tensors[name].shape)}")
+
+    depth = max(len(axes) for name, axes in leading.items() if name != "colors")
+    colors_per_camera = len(leading["colors"]) == depth + 1
+    if colors_per_camera:
+        check_shape("colors", tensors["colors"], [None] * depth + [cameras, n, channels])
+        leading["colors"] = leading["colors"][:-1]
+    try:
+        shape = torch.broadcast_shapes(*leading.values())
+    except RuntimeError:
+        found = ", ".join(f"{name} {list(axes)}" for name, axes in leading.items())
+        raise InputError(f"batch axes: expected shapes that broadcast, found {found}") from None
+    if 0 in shape:
+        raise InputError(f"batch axes: expected at least one entry, found {list(shape)}")
+    return _Batch(tuple(shape), cameras, int(width), int(height), colors_per_camera)
+
+
+def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
+    check_finite("viewmats", viewmats)
+    check_finite("Ks", Ks)
+    views, matrices = (x.detach().cpu().numpy().astype(np.float64) for x in (viewmats, Ks))
+    rotations = views[..., :3, :3]
+    volume = np.prod(np.linalg.norm(rotations, axis=-1), axis=-1)
+    problems = (
+        ("viewmats", "0 0 0 1 as the last row", (views[..., 3, :] != [0, 0, 0, 1]).any(-1)),
+        ("viewmats", "an invertible 3×3 part", np.abs(np.linalg.det(rotations)) <= _SINGULAR * volume),
+        ("Ks", "positive focal lengths", (matrices[..., 0, 0] <= 0) | (matrices[..., 1, 1] <= 0)),
+        ("Ks", "no skew", (matrices[..., 0, 1] != 0) | (matrices[..., 1, 0] != 0)),
+        ("Ks", "0 0 1 as the last row", (matrices[..., 2, :] != [0, 0, 1]).any(-1)),
+    )
+    for name, expected, wrong in problems:
+        if wrong.any():
+            index = tuple(int(i) for i in np.argwhere(wrong)[0])
+            found = (views if name == "viewmats" else matrices)[index].tolist()
+            raise InputError(f"{name}: expected {expected}, found {found} at index {list(index)}")
+
+
+def _slabs(tensor: torch.Tensor, batch: tuple[int, ...], axes: int, camera_axis: bool) -> torch.Tensor:
+    """The tensor as [entries or 1, cameras or 1, ...]; `axes` counts its own axes without the camera's."""
+    lead = tensor.shape[: tensor.ndim - axes - camera_axis]
+    own = tensor.shape[len(lead) :]
+    if math.prod(lead) != 1 and tuple(lead) != batch:
+        tensor = tensor.expand(*batch, *own)
+        lead = batch
+    return tensor.reshape(math.prod(lead), *(own if camera_axis else (1, *own)))
+
+
+def _render_rust(
+    tensors: dict[str, torch.Tensor | None],
+    pixel_mask: torch.Tensor | None,
+    batch: _Batch,
+    settings: RasterSettings,
+    render_mode: RenderMode,
+) -> RenderOutput:
+    def slabs(name: str, axes: int, camera_axis: bool = False) -> torch.Tensor | None:
+        tensor = tensors[name]
+        return None if tensor is None else _slabs(tensor, batch.shape, axes, camera_axis)
+
+    inputs = (
+        slabs("means", 2),
+        slabs("quats", 2),
+        slabs("scales", 2),
+        slabs("opacities", 1),
+        slabs("colors", 2, batch.colors_per_camera),
+        slabs("viewmats", 2, True),
+        slabs("backgrounds", 1, True),
+    )
+    mask = None if pixel_mask is None else _slabs(pixel_mask, batch.shape, 2, True)
+    try:
+        colors, alphas, info = rust.rasterize(
+            inputs, slabs("Ks", 2, True), mask, batch.width, batch.height, settings, render_mode
+        )
+    except ValueError as error:
+        # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                check_finite(name, tensor)
+        raise InputError(str(error)) from None
+    lead = (*batch.shape, batch.cameras)
+    for name in ("means2d", "depths", "radii"):
+        info[name] = info[name].reshape(*lead, *info[name].shape[1:])
+    return RenderOutput(colors.reshape(*lead, *colors.shape[1:]), alphas.reshape(*lead, *alphas.shape[1:]), info)

@@ -1,0 +1,295 @@
+//! `bigs._raster`: the Python face of `bigs-raster`. Arrays in, arrays out; no algorithm, default or limit lives here.
+
+mod convert;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use bigs_raster::{Batch, BatchState, RasterError, RasterSettings, Real, RenderMode, Wanted};
+use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+
+use crate::convert::{Arrays, array, gradient, slice};
+
+/// What the forward pass keeps for the backward pass. Opaque; usable any number of times.
+#[pyclass(frozen, module = "bigs._raster")]
+struct RasterState {
+    kept: Kept,
+}
+
+enum Kept {
+    Single(BatchState<f32>),
+    Double(BatchState<f64>),
+}
+
+/// The scalars that arrays may have.
+trait Scalar: Real + numpy::Element {
+    fn keep(state: BatchState<Self>) -> Kept;
+    fn kept(state: &Kept) -> Option<&BatchState<Self>>;
+}
+
+impl Scalar for f32 {
+    fn keep(state: BatchState<Self>) -> Kept {
+        Kept::Single(state)
+    }
+    fn kept(state: &Kept) -> Option<&BatchState<Self>> {
+        match state {
+            Kept::Single(state) => Some(state),
+            Kept::Double(_) => None,
+        }
+    }
+}
+
+impl Scalar for f64 {
+    fn keep(state: BatchState<Self>) -> Kept {
+        Kept::Double(state)
+    }
+    fn kept(state: &Kept) -> Option<&BatchState<Self>> {
+        match state {
+            Kept::Double(state) => Some(state),
+            Kept::Single(_) => None,
+        }
+    }
+}
+
+/// `bigs.raster.RasterSettings`, read by attribute: a renamed field fails at the border.
+#[derive(FromPyObject)]
+struct Settings {
+    tile_size: u32,
+    eps2d: f64,
+    near_plane: f64,
+    far_plane: f64,
+    radius_clip: f64,
+    alpha_threshold: f64,
+    max_alpha: f64,
+    min_transmittance: f64,
+    antialiased: bool,
+}
+
+impl From<Settings> for RasterSettings {
+    fn from(s: Settings) -> Self {
+        Self {
+            tile_size: s.tile_size,
+            eps2d: s.eps2d,
+            near_plane: s.near_plane,
+            far_plane: s.far_plane,
+            radius_clip: s.radius_clip,
+            alpha_threshold: s.alpha_threshold,
+            max_alpha: s.max_alpha,
+            min_transmittance: s.min_transmittance,
+            antialiased: s.antialiased,
+        }
+    }
+}
+
+fn value_error(error: RasterError) -> PyErr {
+    PyValueError::new_err(error.to_string())
+}
+
+fn mode_named(name: &str) -> PyResult<RenderMode> {
+    RenderMode::from_name(name).ok_or_else(|| {
+        PyValueError::new_err(format!(
+            "render_mode: expected one of RGB, D, ED, RGB+D, RGB+ED, found '{name}'"
+        ))
+    })
+}
+
+/// Runs the engine without the interpreter lock; a panic, which would be a bug, becomes a `RuntimeError`.
+fn run<R: Send>(
+    py: Python<'_>,
+    work: impl FnOnce() -> Result<R, RasterError> + Send,
+) -> PyResult<R> {
+    py.detach(|| catch_unwind(AssertUnwindSafe(work)))
+        .map_err(|_| PyRuntimeError::new_err("the rasteriser failed; please report this as a bug"))?
+        .map_err(value_error)
+}
+
+fn forward<'py, T: Scalar>(
+    py: Python<'py>,
+    arrays: &Arrays<'py, T>,
+    (width, height): (usize, usize),
+    settings: &RasterSettings,
+    mode: RenderMode,
+) -> PyResult<Bound<'py, PyTuple>> {
+    let (shape, inputs) = arrays.inputs(width, height)?;
+    let (images, state) = run(py, || Batch::new(shape, inputs, settings, mode)?.render())?;
+    let (views, n) = (shape.views(), shape.gaussians);
+    (
+        array(
+            py,
+            images.colors,
+            [views, height, width, shape.image_channels(mode)],
+        )?,
+        array(py, images.alphas, [views, height, width, 1])?,
+        array(py, images.means2d.into_flattened(), [views, n, 2])?,
+        array(py, images.depths, [views, n])?,
+        array(py, images.radii.into_flattened(), [views, n, 2])?,
+        RasterState {
+            kept: T::keep(state),
+        },
+    )
+        .into_pyobject(py)
+}
+
+/// Renders a batch.
+///
+/// Every array is `[entries or 1, cameras or 1, ...]`, C-contiguous, float32 or float64 throughout:
+/// means `[.., N, 3]`, quats `[.., N, 4]`, scales `[.., N, 3]`, opacities `[.., N]`, colors `[.., N, D]`,
+/// viewmats `[.., 4, 4]`, Ks `[.., 3, 3]`, backgrounds `[.., D]` or None, pixel_mask `[.., H, W]` or None.
+///
+/// Returns (colors, alphas, means2d, depths, radii, state), views first. Raises ValueError.
+#[pyfunction]
+fn rasterize_forward<'py>(
+    py: Python<'py>,
+    arrays: &Bound<'py, PyTuple>,
+    width: usize,
+    height: usize,
+    settings: Settings,
+    render_mode: &str,
+) -> PyResult<Bound<'py, PyTuple>> {
+    let (settings, mode, size) = (settings.into(), mode_named(render_mode)?, (width, height));
+    match Arrays::<f32>::extract(arrays) {
+        Ok(single) => forward(py, &single, size, &settings, mode),
+        Err(_) => forward(py, &Arrays::<f64>::extract(arrays)?, size, &settings, mode),
+    }
+}
+
+fn backward<'py, T: Scalar>(
+    py: Python<'py>,
+    state: &BatchState<T>,
+    arrays: &Arrays<'py, T>,
+    (width, height): (usize, usize),
+    settings: &RasterSettings,
+    mode: RenderMode,
+    (v_colors, v_alphas): (&Bound<'py, PyAny>, &Bound<'py, PyAny>),
+    wanted: Wanted,
+) -> PyResult<Bound<'py, PyTuple>> {
+    let (shape, inputs) = arrays.inputs(width, height)?;
+    let (v_colors, v_alphas) = (
+        slice::<T>("v_colors", v_colors)?,
+        slice::<T>("v_alphas", v_alphas)?,
+    );
+    let (v_colors, v_alphas) = (v_colors.as_slice()?, v_alphas.as_slice()?);
+    let gradients = run(py, || {
+        Batch::new_trusted(shape, inputs, settings, mode)?
+            .render_vjp(state, v_colors, v_alphas, wanted)
+    })?;
+    (
+        gradient(py, gradients.means),
+        gradient(py, gradients.quats),
+        gradient(py, gradients.scales),
+        gradient(py, gradients.opacities),
+        gradient(py, gradients.colors),
+        gradient(py, gradients.viewmats),
+        gradient(py, gradients.backgrounds),
+        gradients.tiles_skipped,
+    )
+        .into_pyobject(py)
+}
+
+/// Gradients of means, quats, scales, opacities, colors, viewmats (three rows of four) and backgrounds, flat, in the
+/// layout of their input, and the number of tiles without incoming gradient. `wanted` has one flag per input; what is
+/// not wanted is an empty array. Takes the inputs of the forward call that made `state`.
+#[pyfunction]
+fn rasterize_backward<'py>(
+    py: Python<'py>,
+    state: &Bound<'py, RasterState>,
+    arrays: &Bound<'py, PyTuple>,
+    width: usize,
+    height: usize,
+    settings: Settings,
+    render_mode: &str,
+    v_colors: &Bound<'py, PyAny>,
+    v_alphas: &Bound<'py, PyAny>,
+    wanted: [bool; 7],
+) -> PyResult<Bound<'py, PyTuple>> {
+    let (settings, mode, size) = (settings.into(), mode_named(render_mode)?, (width, height));
+    let [
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        backgrounds,
+    ] = wanted;
+    let wanted = Wanted {
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        backgrounds,
+    };
+    let (v, kept) = ((v_colors, v_alphas), &state.get().kept);
+    if let Some(state) = f32::kept(kept) {
+        backward(
+            py,
+            state,
+            &Arrays::extract(arrays)?,
+            size,
+            &settings,
+            mode,
+            v,
+            wanted,
+        )
+    } else if let Some(state) = f64::kept(kept) {
+        backward(
+            py,
+            state,
+            &Arrays::extract(arrays)?,
+            size,
+            &settings,
+            mode,
+            v,
+            wanted,
+        )
+    } else {
+        Err(PyTypeError::new_err(
+            "state: expected one made by rasterize_forward",
+        ))
+    }
+}
+
+#[pymethods]
+impl RasterState {
+    /// Work done and skipped in the forward pass, summed over the views.
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let counters = match &self.kept {
+            Kept::Single(state) => state.counters(),
+            Kept::Double(state) => state.counters(),
+        };
+        let dict = PyDict::new(py);
+        dict.set_item("n_isects", counters.intersections)?;
+        dict.set_item("n_visible", counters.visible)?;
+        dict.set_item("n_empty_tiles", counters.empty_tiles)?;
+        Ok(dict)
+    }
+}
+
+/// The engine's own defaults, by the names of `bigs.raster.RasterSettings`.
+#[pyfunction]
+fn default_settings(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+    let s = RasterSettings::default();
+    let dict = PyDict::new(py);
+    dict.set_item("tile_size", s.tile_size)?;
+    dict.set_item("eps2d", s.eps2d)?;
+    dict.set_item("near_plane", s.near_plane)?;
+    dict.set_item("far_plane", s.far_plane)?;
+    dict.set_item("radius_clip", s.radius_clip)?;
+    dict.set_item("alpha_threshold", s.alpha_threshold)?;
+    dict.set_item("max_alpha", s.max_alpha)?;
+    dict.set_item("min_transmittance", s.min_transmittance)?;
+    dict.set_item("antialiased", s.antialiased)?;
+    Ok(dict)
+}
+
+#[pymodule]
+fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    m.add_class::<RasterState>()?;
+    m.add_function(wrap_pyfunction!(rasterize_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(rasterize_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(default_settings, m)?)
+}

@@ -1,0 +1,93 @@
+//! A pinhole camera.
+
+use crate::error::RasterError;
+use crate::real::Real;
+
+/// Focal lengths and principal point, in pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Intrinsics<T> {
+    /// Focal length along x.
+    pub fx: T,
+    /// Focal length along y.
+    pub fy: T,
+    /// Principal point, x.
+    pub cx: T,
+    /// Principal point, y.
+    pub cy: T,
+}
+
+/// A pinhole camera with OpenCV axes (x right, y down, z forward); the centre of pixel (column i, row j) is
+/// (i + ½, j + ½).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Camera<T> {
+    /// Rotation part of the world-to-camera matrix, row by row.
+    pub(crate) rotation: [[T; 3]; 3],
+    pub(crate) translation: [T; 3],
+    pub(crate) k: Intrinsics<T>,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+}
+
+impl<T: Real> Camera<T> {
+    /// A camera from its row-major world-to-camera matrix. The 3×3 part need not be orthonormal.
+    ///
+    /// # Errors
+    /// A matrix that is not finite, is singular or whose last row is not 0 0 0 1, a focal length that is not
+    /// positive, or an empty image.
+    pub fn new(
+        viewmat: [[T; 4]; 4],
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
+        let bad = |reason| Err(RasterError::BadCamera { reason });
+        if let Some(index) = viewmat.iter().flatten().position(|v| !v.is_finite()) {
+            return Err(RasterError::NotFinite {
+                name: "viewmats",
+                index,
+            });
+        }
+        if let Some(index) = [k.fx, k.fy, k.cx, k.cy].iter().position(|v| !v.is_finite()) {
+            return Err(RasterError::NotFinite { name: "Ks", index });
+        }
+        if viewmat[3] != [T::ZERO, T::ZERO, T::ZERO, T::ONE] {
+            return bad("expected 0 0 0 1 as the last row of the world-to-camera matrix");
+        }
+        let rotation = [0, 1, 2].map(|i| [viewmat[i][0], viewmat[i][1], viewmat[i][2]]);
+        // Relative to the lengths of the rows, so that a scaled world does not look singular.
+        let rows = rotation.map(|r| r.map(Real::as_f64));
+        let volume = rows[0][0] * (rows[1][1] * rows[2][2] - rows[1][2] * rows[2][1])
+            - rows[0][1] * (rows[1][0] * rows[2][2] - rows[1][2] * rows[2][0])
+            + rows[0][2] * (rows[1][0] * rows[2][1] - rows[1][1] * rows[2][0]);
+        let lengths: f64 = rows
+            .iter()
+            .map(|r| r.iter().map(|v| v * v).sum::<f64>().sqrt())
+            .product();
+        if !(volume.abs() > 1e-9 * lengths) {
+            return bad("expected an invertible world-to-camera matrix, found a singular one");
+        }
+        if !(k.fx > T::ZERO && k.fy > T::ZERO) {
+            return bad("expected positive focal lengths");
+        }
+        if width == 0 || height == 0 {
+            return bad("expected an image of at least one pixel");
+        }
+        Ok(Self {
+            rotation,
+            translation: [viewmat[0][3], viewmat[1][3], viewmat[2][3]],
+            k,
+            width,
+            height,
+        })
+    }
+
+    /// Image width in pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Image height in pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+}

@@ -1,0 +1,260 @@
+//! Rotation from a quaternion, and the screen covariance as a whitening transform, with the vjp of each.
+//!
+//! No 2×2 determinant is ever formed as ac − b²: with the rows r₀, r₁ of A (Σ = A Aᵀ + εI),
+//! det Σ = |r₀ × r₁|² + ε(|r₀|² + |r₁|²) + ε², a sum of positive terms that loses nothing for needles.
+
+use crate::real::Real;
+
+pub(crate) type Vec3<T> = [T; 3];
+pub(crate) type Mat3<T> = [[T; 3]; 3];
+
+#[inline(always)]
+pub(crate) fn dot<T: Real>(a: Vec3<T>, b: Vec3<T>) -> T {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+pub(crate) fn cross<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+}
+
+/// The matrix times the vector.
+#[inline(always)]
+pub(crate) fn apply<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
+    [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
+}
+
+/// The transposed matrix times the vector.
+#[inline(always)]
+pub(crate) fn apply_transposed<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
+    [0, 1, 2].map(|j| m[0][j] * v[0] + m[1][j] * v[1] + m[2][j] * v[2])
+}
+
+/// A normalised quaternion and the reciprocal of the length it had; (0, 0, 0, 0) for one without direction.
+#[inline(always)]
+pub(crate) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T) {
+    // Dividing by the largest entry first keeps the squares in range for every finite input.
+    let largest = q[0]
+        .abs()
+        .greater(q[1].abs())
+        .greater(q[2].abs().greater(q[3].abs()));
+    if largest < T::TINY {
+        return ([T::ZERO; 4], T::ZERO);
+    }
+    let r = q.map(|v| v / largest);
+    let inverse = T::ONE / (r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]).sqrt();
+    (r.map(|v| v * inverse), inverse / largest)
+}
+
+/// Rotation matrix of a unit quaternion (w, x, y, z); the identity for (0, 0, 0, 0).
+#[inline(always)]
+pub(crate) fn rotation_of<T: Real>([w, x, y, z]: [T; 4]) -> Mat3<T> {
+    let two = T::ONE + T::ONE;
+    [
+        [
+            T::ONE - two * (y * y + z * z),
+            two * (x * y - w * z),
+            two * (x * z + w * y),
+        ],
+        [
+            two * (x * y + w * z),
+            T::ONE - two * (x * x + z * z),
+            two * (y * z - w * x),
+        ],
+        [
+            two * (x * z - w * y),
+            two * (y * z + w * x),
+            T::ONE - two * (x * x + y * y),
+        ],
+    ]
+}
+
+/// Gradient with respect to a raw quaternion, given its unit form, the reciprocal of its length and the gradient of
+/// the rotation matrix. Tangent to the sphere by construction.
+#[inline(always)]
+pub(crate) fn rotation_vjp<T: Real>(unit: [T; 4], inverse_length: T, v: &Mat3<T>) -> [T; 4] {
+    let [w, x, y, z] = unit;
+    let two = T::ONE + T::ONE;
+    let v_unit = [
+        two * (x * (v[2][1] - v[1][2]) + y * (v[0][2] - v[2][0]) + z * (v[1][0] - v[0][1])),
+        two * (y * (v[0][1] + v[1][0]) + z * (v[0][2] + v[2][0]) + w * (v[2][1] - v[1][2])
+            - two * x * (v[1][1] + v[2][2])),
+        two * (x * (v[0][1] + v[1][0]) + z * (v[1][2] + v[2][1]) + w * (v[0][2] - v[2][0])
+            - two * y * (v[0][0] + v[2][2])),
+        two * (x * (v[0][2] + v[2][0]) + y * (v[1][2] + v[2][1]) + w * (v[1][0] - v[0][1])
+            - two * z * (v[0][0] + v[1][1])),
+    ];
+    let radial =
+        unit[0] * v_unit[0] + unit[1] * v_unit[1] + unit[2] * v_unit[2] + unit[3] * v_unit[3];
+    [0, 1, 2, 3].map(|i| inverse_length * (v_unit[i] - unit[i] * radial))
+}
+
+/// √(½ log₂ e): with it folded into the whitening, exp(−q/2) = 2^−(u² + v²).
+const EXP2_SCALE: f64 = 0.849_321_800_288_019_1;
+
+/// The screen covariance Σ = A Aᵀ + εI in the form the compositor uses.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Whitening<T> {
+    /// (u, v) = (w11 dx + w12 dy, w22 dy) has exp(−½ dᵀΣ⁻¹d) = 2^−(u² + v²).
+    pub(crate) w11: T,
+    pub(crate) w12: T,
+    pub(crate) w22: T,
+    /// Variances of Σ along x and y, in px².
+    pub(crate) variances: [T; 2],
+    /// √(det A Aᵀ / det Σ): what `antialiased` scales opacity by.
+    pub(crate) compensation: T,
+}
+
+/// The whitening of A with rows `r0`, `r1`; `None` if Σ is singular or overflows.
+#[inline(always)]
+pub(crate) fn whiten<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Option<Whitening<T>> {
+    let n = cross(r0, r1);
+    let (a0, c0) = (dot(r0, r0), dot(r1, r1));
+    let (a, b, c) = (a0 + eps, dot(r0, r1), c0 + eps);
+    let area = dot(n, n);
+    let det = area + eps * (a0 + c0) + eps * eps;
+    if !(det >= T::TINY && det.is_finite()) {
+        return None;
+    }
+    let scale = T::of(EXP2_SCALE);
+    let w11 = scale * (c / det).sqrt();
+    Some(Whitening {
+        w11,
+        w12: -w11 * (b / c),
+        w22: scale / c.sqrt(),
+        variances: [a, c],
+        compensation: (area / det).sqrt(),
+    })
+}
+
+/// Gradients of the rows of A.
+///
+/// `moments` are Σ v_e·uu, Σ v_e·uv, Σ v_e·vv over pixels, where v_e is the gradient of the exponent of two; in
+/// whitened coordinates the gradient of Σ is (1/κ²) Wᵀ · moments · W with κ = √(½ log₂ e), free of cancellation.
+#[inline(always)]
+pub(crate) fn whiten_vjp<T: Real>(
+    r0: Vec3<T>,
+    r1: Vec3<T>,
+    eps: T,
+    w: &Whitening<T>,
+    moments: [T; 3],
+    v_compensation: T,
+) -> (Vec3<T>, Vec3<T>) {
+    let two = T::ONE + T::ONE;
+    let inverse = T::of(1.0 / (EXP2_SCALE * EXP2_SCALE));
+    let [uu, uv, vv] = moments;
+    let v_a = inverse * w.w11 * w.w11 * uu;
+    let v_b = inverse * w.w11 * (w.w12 * uu + w.w22 * uv);
+    let v_c = inverse * (w.w12 * (w.w12 * uu + two * w.w22 * uv) + w.w22 * w.w22 * vv);
+    let mut v_r0 = [0, 1, 2].map(|i| two * (v_a * r0[i] + v_b * r1[i]));
+    let mut v_r1 = [0, 1, 2].map(|i| two * (v_b * r0[i] + v_c * r1[i]));
+    if v_compensation != T::ZERO {
+        // compensation = |n| / √det with n = r₀ × r₁
+        let n = cross(r0, r1);
+        let area = dot(n, n);
+        let (a0, c0) = (dot(r0, r0), dot(r1, r1));
+        let det = area + eps * (a0 + c0) + eps * eps;
+        let v_det = -v_compensation * w.compensation / (two * det);
+        let along = if area >= T::TINY {
+            v_compensation / (area * det).sqrt()
+        } else {
+            T::ZERO
+        };
+        let v_n = n.map(|x| x * (along + two * v_det));
+        let (from_r0, from_r1) = (cross(r1, v_n), cross(v_n, r0));
+        for i in 0..3 {
+            v_r0[i] += from_r0[i] + two * eps * v_det * r0[i];
+            v_r1[i] += from_r1[i] + two * eps * v_det * r1[i];
+        }
+    }
+    (v_r0, v_r1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn difference(mut f: impl FnMut(f64) -> f64) -> f64 {
+        let h = 1e-6;
+        (f(h) - f(-h)) / (2.0 * h)
+    }
+
+    #[test]
+    fn rotation_gradient_is_the_derivative() {
+        let q = [0.4, -1.1, 0.7, 0.2];
+        let weights = [[0.3, -0.8, 1.0], [0.1, 0.7, -0.2], [-0.5, 0.9, 0.4]];
+        let loss = |q| {
+            let r = rotation_of(normalize_quat(q).0);
+            (0..3).map(|i| dot(r[i], weights[i])).sum::<f64>()
+        };
+        let (unit, inverse) = normalize_quat(q);
+        let gradient = rotation_vjp(unit, inverse, &weights);
+        for i in 0..4 {
+            let expected = difference(|h| {
+                let mut moved = q;
+                moved[i] += h;
+                loss(moved)
+            });
+            assert!(
+                (gradient[i] - expected).abs() < 1e-8,
+                "{i}: {} {expected}",
+                gradient[i]
+            );
+        }
+    }
+
+    #[test]
+    fn whitening_gradient_is_the_derivative() {
+        let rows = [[1.5, 0.2, -0.4], [0.3, 0.9, 0.1]];
+        let (d, weight, eps) = ([0.7, -1.2], 0.8, 0.3);
+        let value = |rows: [[f64; 3]; 2]| {
+            let w = whiten(rows[0], rows[1], eps).unwrap();
+            let (u, v) = (w.w11 * d[0] + w.w12 * d[1], w.w22 * d[1]);
+            -(u * u + v * v) + weight * w.compensation
+        };
+        let w = whiten(rows[0], rows[1], eps).unwrap();
+        let (u, v) = (w.w11 * d[0] + w.w12 * d[1], w.w22 * d[1]);
+        let (g0, g1) = whiten_vjp(rows[0], rows[1], eps, &w, [u * u, u * v, v * v], weight);
+        for (row, gradient) in [(0, g0), (1, g1)] {
+            for i in 0..3 {
+                let expected = difference(|h| {
+                    let mut moved = rows;
+                    moved[row][i] += h;
+                    value(moved)
+                });
+                assert!((gradient[i] - expected).abs() < 1e-8);
+            }
+        }
+    }
+
+    #[test]
+    fn needles_keep_their_determinant() {
+        // 300 px long with ratio 1e4: ac − b² in f32 loses two digits here.
+        let (cos, sin) = (0.6f64, 0.8f64);
+        let long = [300.0 * cos, 300.0 * sin];
+        let short = [-0.03 * sin, 0.03 * cos];
+        let exact = whiten([long[0], short[0], 0.0], [long[1], short[1], 0.0], 0.3).unwrap();
+        let single = whiten(
+            [long[0] as f32, short[0] as f32, 0.0],
+            [long[1] as f32, short[1] as f32, 0.0],
+            0.3,
+        )
+        .unwrap();
+        assert!((f64::from(single.w11) / exact.w11 - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn hopeless_covariances_are_refused() {
+        assert!(whiten([0.0f32; 3], [0.0; 3], 0.0).is_none());
+        assert!(whiten([1e30f32, 0.0, 0.0], [0.0, 1e30, 0.0], 0.3).is_none());
+        assert_eq!(normalize_quat([0.0f32; 4]), ([0.0; 4], 0.0));
+        assert_eq!(
+            normalize_quat([1e-30f32, 0.0, 0.0, 0.0]).0,
+            [1.0, 0.0, 0.0, 0.0]
+        );
+    }
+}

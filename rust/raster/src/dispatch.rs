@@ -1,0 +1,195 @@
+//! Compiles the kernels once per CPU feature level and picks the best at run time.
+//!
+//! The only `unsafe` of the crate is here: calling a function compiled for features that were just detected.
+
+use std::sync::OnceLock;
+
+use crate::kernel::{
+    MAX_CHANNELS, MAX_PIXELS, Scratch, TileCotangents, TileImage, TileTask, backward_tile,
+    forward_tile,
+};
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+use crate::real::Fused;
+use crate::real::{Real, Separate};
+
+/// CPU features that the kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum SimdLevel {
+    /// What the target guarantees; no fused multiply-add.
+    Baseline,
+    /// ARM's 128-bit vectors.
+    #[cfg(target_arch = "aarch64")]
+    Neon,
+    /// 256-bit vectors with fused multiply-add.
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    /// 512-bit vectors.
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+}
+
+impl SimdLevel {
+    /// The best level of this machine. `BIGS_RASTER_SIMD=baseline|avx2|avx512` lowers it, for tests and comparisons.
+    pub(crate) fn detect() -> Self {
+        static LEVEL: OnceLock<SimdLevel> = OnceLock::new();
+        *LEVEL.get_or_init(|| {
+            let wanted = std::env::var("BIGS_RASTER_SIMD").unwrap_or_default();
+            Self::available()
+                .into_iter()
+                .find(|level| wanted.is_empty() || level.name() == wanted)
+                .unwrap_or(Self::Baseline)
+        })
+    }
+
+    /// What it is called in `BIGS_RASTER_SIMD`.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Baseline => "baseline",
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => "neon",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => "avx512",
+        }
+    }
+
+    /// Every level of this machine, the best first.
+    pub(crate) fn available() -> Vec<Self> {
+        let mut levels = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            let avx2 = is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2")
+                && is_x86_feature_detected!("popcnt")
+                && is_x86_feature_detected!("lzcnt");
+            if avx2
+                && is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512dq")
+            {
+                levels.push(Self::Avx512);
+            }
+            if avx2 {
+                levels.push(Self::Avx2);
+            }
+        }
+        #[cfg(target_arch = "aarch64")]
+        levels.push(Self::Neon);
+        levels.push(Self::Baseline);
+        levels
+    }
+}
+
+macro_rules! compiled_for {
+    ($module:ident, $features:literal) => {
+        #[cfg(target_arch = "x86_64")]
+        mod $module {
+            use super::*;
+
+            #[target_feature(enable = $features)]
+            pub(super) fn forward<T: Real, const K: usize>(
+                task: &TileTask<'_, T>,
+                open: &[bool; MAX_PIXELS],
+                scratch: &mut Scratch<T>,
+                out: TileImage<'_, T>,
+            ) {
+                forward_tile::<T, Fused, K>(task, open, scratch, out);
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn backward<T: Real, const K: usize>(
+                task: &TileTask<'_, T>,
+                pixels: &TileCotangents<'_, T>,
+                slots: &mut [T],
+                stride: usize,
+            ) {
+                backward_tile::<T, Fused, K>(task, pixels, slots, stride);
+            }
+        }
+    };
+}
+compiled_for!(avx2, "avx2,fma,bmi1,bmi2,popcnt,lzcnt");
+compiled_for!(
+    avx512,
+    "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma,bmi1,bmi2,popcnt,lzcnt"
+);
+
+#[allow(unsafe_code)]
+fn forward_level<T: Real, const K: usize>(
+    level: SimdLevel,
+    task: &TileTask<'_, T>,
+    open: &[bool; MAX_PIXELS],
+    scratch: &mut Scratch<T>,
+    out: TileImage<'_, T>,
+) {
+    match level {
+        SimdLevel::Baseline => forward_tile::<T, Separate, K>(task, open, scratch, out),
+        #[cfg(target_arch = "aarch64")]
+        SimdLevel::Neon => forward_tile::<T, Fused, K>(task, open, scratch, out),
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe { avx2::forward::<T, K>(task, open, scratch, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe { avx512::forward::<T, K>(task, open, scratch, out) },
+    }
+}
+
+#[allow(unsafe_code)]
+fn backward_level<T: Real, const K: usize>(
+    level: SimdLevel,
+    task: &TileTask<'_, T>,
+    pixels: &TileCotangents<'_, T>,
+    slots: &mut [T],
+    stride: usize,
+) {
+    match level {
+        SimdLevel::Baseline => backward_tile::<T, Separate, K>(task, pixels, slots, stride),
+        #[cfg(target_arch = "aarch64")]
+        SimdLevel::Neon => backward_tile::<T, Fused, K>(task, pixels, slots, stride),
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K>(task, pixels, slots, stride) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K>(task, pixels, slots, stride) },
+    }
+}
+
+/// Composites the next (at most `MAX_CHANNELS`) channels of a tile; unused channels of a kernel are zero.
+pub(crate) fn forward<T: Real>(
+    level: SimdLevel,
+    task: &TileTask<'_, T>,
+    open: &[bool; MAX_PIXELS],
+    scratch: &mut Scratch<T>,
+    out: TileImage<'_, T>,
+) {
+    match task.channels.total - task.first {
+        1 => forward_level::<T, 1>(level, task, open, scratch, out),
+        2..=3 => forward_level::<T, 3>(level, task, open, scratch, out),
+        4 => forward_level::<T, 4>(level, task, open, scratch, out),
+        5..=6 => forward_level::<T, 6>(level, task, open, scratch, out),
+        _ => forward_level::<T, MAX_CHANNELS>(level, task, open, scratch, out),
+    }
+}
+
+/// The vjp of [`forward`], added to `slots`.
+pub(crate) fn backward<T: Real>(
+    level: SimdLevel,
+    task: &TileTask<'_, T>,
+    pixels: &TileCotangents<'_, T>,
+    slots: &mut [T],
+    stride: usize,
+) {
+    match task.channels.total - task.first {
+        1 => backward_level::<T, 1>(level, task, pixels, slots, stride),
+        2..=3 => backward_level::<T, 3>(level, task, pixels, slots, stride),
+        4 => backward_level::<T, 4>(level, task, pixels, slots, stride),
+        5..=6 => backward_level::<T, 6>(level, task, pixels, slots, stride),
+        _ => backward_level::<T, MAX_CHANNELS>(level, task, pixels, slots, stride),
+    }
+}

@@ -1,0 +1,70 @@
+//! What a caller can get wrong.
+
+use std::fmt;
+
+/// An input that cannot be rendered; the message names the input, what was expected and what was found.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RasterError {
+    /// An array has the wrong number of elements.
+    LengthMismatch {
+        /// Which array.
+        name: &'static str,
+        /// Elements expected.
+        expected: usize,
+        /// Elements found.
+        got: usize,
+    },
+    /// A value is NaN or infinite.
+    NotFinite {
+        /// Which array.
+        name: &'static str,
+        /// Position in the flat array.
+        index: usize,
+    },
+    /// A camera whose matrix cannot be inverted, is not a world-to-camera matrix, or has no focal length.
+    BadCamera {
+        /// What is wrong with it.
+        reason: &'static str,
+    },
+    /// A setting is outside its range.
+    BadSetting {
+        /// Which setting.
+        name: &'static str,
+        /// The range that is accepted.
+        expected: &'static str,
+    },
+    /// More Gaussian-tile intersections than a 32-bit index can number.
+    TooManyIntersections,
+}
+
+impl fmt::Display for RasterError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::LengthMismatch {
+                name,
+                expected,
+                got,
+            } => {
+                write!(f, "{name}: expected {expected} elements, found {got}")
+            }
+            Self::NotFinite { name, index } => {
+                write!(
+                    f,
+                    "{name}: expected finite values, found NaN or infinity at flat index {index}"
+                )
+            }
+            Self::BadCamera { reason } => write!(f, "camera: {reason}"),
+            Self::BadSetting { name, expected } => {
+                write!(f, "settings.{name}: expected {expected}")
+            }
+            Self::TooManyIntersections => {
+                write!(
+                    f,
+                    "Gaussians: expected fewer than 2^32 Gaussian-tile intersections in one image"
+                )
+            }
+        }
+    }
+}
+
+impl std::error::Error for RasterError {}
