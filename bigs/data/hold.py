@@ -59,10 +59,7 @@ def load_hold(path: str | Path) -> Clip:
     frame_names = _frame_names(folder / "corres.txt", image_paths)
     _check_pairs(image_paths, mask_paths)
 
-    data = load_npy(file)
-    if isinstance(data, np.ndarray) and data.shape == ():
-        data = data.item()
-    data = mapping_field(str(file), data)
+    data = mapping_field(str(file), load_npy(file))
     frames = len(image_paths)
     height, width = read_image(image_paths[0]).shape[:2]
     K, cam_from_world, scene_scale = _read_cameras(file, data, frames, width)

@@ -127,7 +127,7 @@ def make_clip(
 
 
 class _Streams:
-    """Random numbers for each thing, so that a clip with one hand shows the same object in the same motion."""
+    """Random numbers for each thing, so that with one hand the same object moves the same way."""
 
     def __init__(self, seed: int) -> None:
         children = iter(np.random.SeedSequence(seed).spawn(9))
@@ -236,7 +236,7 @@ def _seen_points(
 ) -> np.ndarray:
     """Points [N, 3] that structure from motion would find: seen in several frames, denser on print."""
     areas = face_areas(solid.mesh.vertices, solid.mesh.faces)
-    faces = rng.choice(len(areas), size=6000, p=areas / areas.sum())
+    faces = rng.choice(len(areas), size=13000, p=areas / areas.sum())
     weights = rng.dirichlet((1, 1, 1), size=len(faces))
     points = np.einsum("nk,nki->ni", weights, solid.mesh.vertices[solid.mesh.faces[faces]])
     times_seen = np.sum(

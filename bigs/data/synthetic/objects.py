@@ -77,9 +77,9 @@ def _rounded_box(points: np.ndarray, center: np.ndarray, half: np.ndarray, radiu
 
 
 def _revolved(radius: np.ndarray, z: np.ndarray, profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the solid whose radius over height is the polyline `profile` [K, 2], and its slope [N, 2].
+    """Distance [N] to the solid whose radius over height is the polyline `profile` [K, 2], and its slope.
 
-    The slope is the unit gradient over (radius, z).
+    The slope [N, 2] is the unit gradient over (radius, z).
     """
     p = np.stack([radius, z], axis=1)
     nearest, best = np.zeros_like(p), np.full(len(p), np.inf)

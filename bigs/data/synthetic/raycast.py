@@ -104,16 +104,19 @@ class _Rays:
         triangles = caster.intersects_first(np.zeros_like(directions), directions)
         ray = np.flatnonzero(triangles >= 0)
         triangles, directions = triangles[ray], directions[ray]
-        corners = body.verts[body.faces[triangles]]
-        edges = corners[:, 1:] - corners[:, :1]
-        # o + z d = a + s e1 + t e2, with z the depth since directions have unit z.
-        system = np.stack([directions, -edges[:, 0], -edges[:, 1]], axis=2)
-        solvable = np.abs(np.linalg.det(system)) > 1e-18
-        ray, triangles, system, corners = (a[solvable] for a in (ray, triangles, system, corners))
-        z, s, t = np.linalg.solve(system, corners[:, 0, :, None])[..., 0].T
+        a, b, c = body.verts[body.faces[triangles]].transpose(1, 0, 2)
+        # z d = a + s (b - a) + t (c - a) by Cramer's rule; z is the depth since directions have unit z.
+        toward_b, toward_c = b - a, c - a
+        normal = np.cross(toward_b, toward_c)
+        facing = (directions * normal).sum(1)
+        moment = np.cross(directions, a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (a * normal).sum(1) / facing
+            s, t = -(toward_c * moment).sum(1) / facing, (toward_b * moment).sum(1) / facing
         columns_per_row = columns.stop - columns.start
         row, column = rows.start + ray // columns_per_row, columns.start + ray % columns_per_row
-        front = z < self.depth[row, column]
+        # A triangle seen exactly edge on has no depth, and nothing to show.
+        front = (facing != 0) & (z < self.depth[row, column])
         row, column, z = row[front], column[front], z[front]
         self.depth[row, column] = z
         weights = np.clip(np.stack([1 - s - t, s, t], axis=1)[front], 0, 1)

@@ -11,10 +11,10 @@ def solid_noise(points: np.ndarray, cell: float, seed: int) -> np.ndarray:
     base = np.floor(scaled).astype(np.int64)
     t = scaled - base
     t = t * t * (3 - 2 * t)
+    sides = (1 - t).T, t.T
     total = np.zeros(len(points))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(np.where(np.array(corner) == 1, t, 1 - t), axis=1)
-        total += weight * _hash(base + corner, seed)
+    for i, j, k in np.ndindex(2, 2, 2):
+        total += sides[i][0] * sides[j][1] * sides[k][2] * _hash(base + (i, j, k), seed)
     return total
 
 
