@@ -70,7 +70,7 @@ def test_ssim_mask_selects_pixels_of_the_map(images):
 
 
 def test_ssim_gradients_of_both_images(images):
-    pred, gt = (image[:, :, :6, :8].clone().requires_grad_() for image in images)
+    pred, gt = (image[:1, :2, :5, :6].clone().requires_grad_() for image in images)
     assert torch.autograd.gradcheck(lambda p, g: ssim_map(p, g, window=5), (pred, gt))
     assert torch.autograd.gradcheck(lambda p: ssim_map(p, gt.detach(), window=5), (pred,))
     assert torch.autograd.gradcheck(lambda g: ssim_map(pred.detach(), g, window=5), (gt,))

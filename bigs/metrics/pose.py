@@ -1,0 +1,55 @@
+"""Hand pose scores: joints relative to the wrist, and where the wrist is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def mpjpe(pred: np.ndarray, gt: np.ndarray) -> np.ndarray:
+    """Mean per-joint position error of each frame, each side relative to its own joint 0.
+
+    The root counts as one of the joints, with error 0, as the ARCTIC and HO-3D evaluators have it.
+
+    Args:
+        pred: joints [T, 21, 3], metres.
+        gt: joints [T, 21, 3], metres.
+
+    Returns:
+        [T] millimetres.
+    """
+    relative = (pred - pred[:, :1]) - (gt - gt[:, :1])
+    return 1000.0 * np.linalg.norm(relative, axis=-1).mean(axis=-1)
+
+
+def clip_scale(pred_points: np.ndarray, gt_points: np.ndarray) -> float:
+    """The one scale about the camera centre that a clip is allowed before positions are compared.
+
+    A single camera cannot tell a small near scene from a large far one, so the least-squares scale argmin_s
+    sum |s pred - gt|² over corresponding points is taken out. It is a property of the whole clip: give it the
+    points of all frames together.
+
+    Args:
+        pred_points: [..., 3] metres, camera frame.
+        gt_points: [..., 3] metres, camera frame. Points that are not finite on either side are left out.
+
+    Returns:
+        The scale, 1 when no finite point is left.
+    """
+    finite = np.isfinite(pred_points).all(axis=-1) & np.isfinite(gt_points).all(axis=-1)
+    pred, gt = pred_points[finite].astype(np.float64), gt_points[finite].astype(np.float64)
+    energy = float(np.sum(pred * pred))
+    return float(np.sum(pred * gt)) / energy if energy > 0.0 else 1.0
+
+
+def wrist_error(pred: np.ndarray, gt: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Distance between the wrists of each frame after the clip's scale.
+
+    Args:
+        pred: joints [T, 21, 3], metres, camera frame.
+        gt: joints [T, 21, 3], metres, camera frame.
+        scale: multiplies `pred`, see `clip_scale`.
+
+    Returns:
+        [T] millimetres.
+    """
+    return 1000.0 * np.linalg.norm(scale * pred[:, 0] - gt[:, 0], axis=-1)
