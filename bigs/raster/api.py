@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from bigs.checks import InputError, check_choice, check_finite, check_shape
-from bigs.raster import rust
+from bigs.raster import cuda, reference, rust
 from bigs.raster.settings import RasterSettings
 from bigs.types import RenderOutput
 
@@ -95,7 +95,11 @@ def rasterization(
     for name, tensor in tensors.items():
         if tensor is not None:
             check_finite(name, tensor)
-    raise InputError(f"backend: '{backend}' is not available")
+    expanded = _expanded(tensors, batch)
+    mask = None if pixel_mask is None else pixel_mask.expand(*batch.shape, *pixel_mask.shape[-3:])
+    if backend == "gsplat":
+        return RenderOutput(*cuda.rasterize(expanded, mask, batch.width, batch.height, settings, render_mode))
+    return _render_torch(expanded, mask, batch, settings, render_mode)
 
 
 class _Batch(NamedTuple):
@@ -126,7 +130,9 @@ def _check_kind(tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tenso
             found = getattr(pixel_mask, "dtype", type(pixel_mask).__name__)
             raise InputError(f"pixel_mask: expected a bool tensor, found {found}")
         if pixel_mask.device != means.device:
-            raise InputError(f"pixel_mask: expected the device of means, {means.device}, found {pixel_mask.device}")
+            raise InputError(
+                f"pixel_mask: expected the device of means, {means.device}, found {pixel_mask.device}"
+            )
 
 
 def _batch_of(
@@ -242,4 +248,46 @@ def _render_rust(
     lead = (*batch.shape, batch.cameras)
     for name in ("means2d", "depths", "radii"):
         info[name] = info[name].reshape(*lead, *info[name].shape[1:])
-    return RenderOutput(colors.reshape(*lead, *colors.shape[1:]), alphas.reshape(*lead, *alphas.shape[1:]), info)
+    return RenderOutput(
+        colors.reshape(*lead, *colors.shape[1:]), alphas.reshape(*lead, *alphas.shape[1:]), info
+    )
+
+
+def _expanded(tensors: dict[str, torch.Tensor | None], batch: _Batch) -> dict[str, torch.Tensor | None]:
+    """All inputs with all batch axes."""
+    axes = {"opacities": 1, "viewmats": 3, "Ks": 3, "colors": 2 + batch.colors_per_camera}
+    return {
+        name: None if x is None else x.expand(*batch.shape, *x.shape[x.ndim - axes.get(name, 2) :])
+        for name, x in tensors.items()
+    }
+
+
+def _render_torch(
+    tensors: dict[str, torch.Tensor | None],
+    pixel_mask: torch.Tensor | None,
+    batch: _Batch,
+    settings: RasterSettings,
+    render_mode: RenderMode,
+) -> RenderOutput:
+    results = []
+    for index in np.ndindex(*batch.shape, batch.cameras):
+        entry = index[:-1]
+        gaussians = [tensors[name][entry] for name in ("means", "quats", "scales", "opacities")]
+        colors = tensors["colors"][index if batch.colors_per_camera else entry]
+        cameras = [tensors[name][index] for name in ("viewmats", "Ks")]
+        optional = [None if x is None else x[index] for x in (tensors["backgrounds"], pixel_mask)]
+        results.append(
+            reference.rasterize_view(
+                *gaussians, colors, *cameras, batch.width, batch.height, settings, *optional, render_mode
+            )
+        )
+    lead = (*batch.shape, batch.cameras)
+    images, alphas, infos = zip(*results, strict=True)
+    info = {
+        name: torch.stack([i[name] for i in infos]).reshape(*lead, *infos[0][name].shape) for name in infos[0]
+    }
+    return RenderOutput(
+        torch.stack(images).reshape(*lead, *images[0].shape),
+        torch.stack(alphas).reshape(*lead, *alphas[0].shape),
+        {"tile_size": settings.tile_size, **info},
+    )

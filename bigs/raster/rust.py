@@ -28,7 +28,9 @@ def _array(tensor: torch.Tensor | None) -> np.ndarray | None:
     return None if tensor is None else tensor.detach().contiguous().numpy()
 
 
-def _engine_arrays(inputs: tuple[torch.Tensor | None, ...], constants: tuple[torch.Tensor | None, ...]) -> tuple:
+def _engine_arrays(
+    inputs: tuple[torch.Tensor | None, ...], constants: tuple[torch.Tensor | None, ...]
+) -> tuple:
     *gaussians_and_views, backgrounds = inputs
     Ks, pixel_mask = constants
     return tuple(map(_array, (*gaussians_and_views, Ks, backgrounds, pixel_mask)))

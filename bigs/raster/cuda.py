@@ -1,0 +1,72 @@
+"""CUDA tensors through gsplat, where it is installed."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import fields
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from bigs.checks import InputError
+from bigs.raster.settings import RasterSettings
+
+# gsplat has these as constants of its kernels.
+_FIXED = ("alpha_threshold", "max_alpha", "min_transmittance")
+
+
+def _gsplat() -> ModuleType:
+    try:
+        return importlib.import_module("gsplat")
+    except ImportError:
+        raise InputError(
+            "backend: expected the package gsplat for CUDA tensors, found it is not installed "
+            "(pip install gsplat, or move the tensors to the CPU)"
+        ) from None
+
+
+def rasterize(
+    tensors: dict[str, torch.Tensor | None],
+    pixel_mask: torch.Tensor | None,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+    render_mode: str,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Render checked inputs with equal batch axes, by the names of `bigs.raster.rasterization`.
+
+    Raises:
+        InputError: gsplat is missing, or a setting differs that gsplat cannot change.
+    """
+    gsplat = _gsplat()
+    defaults = {field.name: field.default for field in fields(RasterSettings)}
+    for name in _FIXED:
+        if getattr(settings, name) != defaults[name]:
+            raise InputError(
+                f"settings.{name}: expected gsplat's constant {defaults[name]} for backend 'gsplat', "
+                f"found {getattr(settings, name)}"
+            )
+    backgrounds = tensors["backgrounds"]
+    colors, alphas, info = gsplat.rasterization(
+        **{name: tensor for name, tensor in tensors.items() if name != "backgrounds"},
+        width=width,
+        height=height,
+        backgrounds=backgrounds,
+        near_plane=settings.near_plane,
+        far_plane=settings.far_plane,
+        radius_clip=settings.radius_clip,
+        eps2d=settings.eps2d,
+        tile_size=settings.tile_size,
+        rasterize_mode="antialiased" if settings.antialiased else "classic",
+        render_mode=render_mode,
+        packed=False,
+    )
+    if pixel_mask is not None:
+        inside = pixel_mask[..., None]
+        behind = torch.zeros_like(colors[..., :1, :1, :])
+        if backgrounds is not None and "RGB" in render_mode:
+            behind[..., : backgrounds.shape[-1]] = backgrounds.detach()[..., None, None, :]
+        colors = torch.where(inside, colors, behind)
+        alphas = torch.where(inside, alphas, torch.zeros_like(alphas))
+    return colors, alphas, info
