@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -39,11 +40,11 @@ def rasterization(
 ) -> RenderOutput:
     """Render 3D Gaussians (paper Eq. 1 and 2) into C cameras, differentiably.
 
-    Names, shapes and rules are gsplat's. Leading batch axes "..." broadcast: an input without them, or of size 1
-    along all of them, is shared by all batch entries without being copied, and its gradient is the sum over them.
-    Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds; Ks gets none. The result is the
-    same, bit for bit, for any number of threads (`RAYON_NUM_THREADS`). Call it in the main process only: a forked
-    worker has no threads.
+    Names, shapes and rules are gsplat's. Leading batch axes "..." broadcast: an input without them, or of
+    size 1 along all of them, is shared by all batch entries without being copied, and its gradient is the sum
+    over them. Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds; Ks gets none.
+    The result is the same, bit for bit, for any number of threads (`RAYON_NUM_THREADS`). Call it in the main
+    process only: a forked worker has no threads.
 
     Args:
         means: centres in the world, metres.
@@ -57,15 +58,16 @@ def rasterization(
         height: of the images, pixels.
         settings: every threshold; gsplat's values by default.
         backgrounds: the colour behind everything; black by default. Depth has none.
-        pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the background
-            with alpha 0.
-        render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or colours and depth.
-        backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors, gsplat for
-            CUDA tensors.
+        pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the
+            background with alpha 0.
+        render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
+        backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,
+            gsplat for CUDA tensors.
 
     Returns:
-        Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1], and info:
-        means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N], n_isects, counters.
+        Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1], and
+        info: means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N] (zeros for a Gaussian
+        that no pixel sees), tile_size, and from the rust backend n_isects, n_visible and n_empty_tiles.
 
     Raises:
         InputError: a shape, dtype, value or camera that cannot be rendered.
@@ -161,7 +163,9 @@ def _batch_of(
             continue
         expected = trailing[name]
         found = tuple(tensor.shape[max(tensor.ndim - len(expected), 0) :])
-        if len(found) < len(expected) or any(isinstance(e, int) and e != f for e, f in zip(expected, found)):
+        if len(found) < len(expected) or any(
+            isinstance(e, int) and e != f for e, f in zip(expected, found, strict=True)
+        ):
             shown = ", ".join(map(str, ("...", *expected)))
             raise InputError(f"{name}: expected shape [{shown}], found {list(tensor.shape)}")
         leading[name] = tuple(tensor.shape[: tensor.ndim - len(expected)])

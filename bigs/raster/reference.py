@@ -1,6 +1,6 @@
 """The slow, obvious twin of the engine: every pixel against every Gaussian, gradients by autograd.
 
-No tiles, no culling, no shared code with the engine. Memory is pixels × Gaussians per view, so it is for small scenes.
+No tiles, no culling, no shared code with the engine. Memory is pixels × Gaussians per view: for small scenes.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _project(
     height: int,
     settings: RasterSettings,
 ) -> tuple[_Screen, dict[str, torch.Tensor]]:
-    """EWA splatting: the Gaussian under the Jacobian of the projection at its centre (Zwicker et al. 2001)."""
+    """EWA splatting: the Gaussian under the Jacobian of the projection at its centre (Zwicker 2001)."""
     in_front = means @ viewmat[2, :3] + viewmat[2, 3]
     ids = torch.nonzero((in_front > settings.near_plane) & (in_front < settings.far_plane))[:, 0]
     points = means[ids] @ viewmat[:3, :3].T + viewmat[:3, 3]

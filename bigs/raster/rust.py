@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from bigs import _raster
 from bigs.raster.settings import RasterSettings
 
-# The differentiable inputs, in the order of the engine's arrays; Ks stands between viewmats and backgrounds there.
+# The differentiable inputs, in the order of the engine's arrays; there Ks follows viewmats.
 Inputs = tuple[
     torch.Tensor,  # means [S, 1, N, 3]
     torch.Tensor,  # quats [S, 1, N, 4]

@@ -10,20 +10,20 @@ class RasterSettings:
     """The rules of the renderer. The defaults are gsplat's, so that images agree."""
 
     tile_size: int = 16
-    """Side of a square tile in pixels: 4, 8 or 16. Tiles share one depth-ordered list; 16 measured fastest."""
+    """Side of a square tile in pixels: 4, 8 or 16. A tile has one depth-ordered list; 16 measured fastest."""
     eps2d: float = 0.3
     """Added to both variances on screen, in px²: a Gaussian thinner than a pixel still covers one."""
     near_plane: float = 0.01
-    """Gaussians whose centre is nearer than this along the camera axis are skipped: projection is singular at 0."""
+    """Gaussians whose centre has a smaller camera z are skipped: projection is singular at 0."""
     far_plane: float = 1e10
-    """Gaussians whose centre is further than this are skipped."""
+    """Gaussians whose centre has a larger camera z are skipped."""
     radius_clip: float = 0.0
     """Gaussians whose radii on screen are both at most this many pixels are skipped; 0 keeps all."""
     alpha_threshold: float = 1.0 / 255.0
-    """A (pixel, Gaussian) pair with alpha below this is skipped: what an 8-bit image cannot show. 0 skips none."""
+    """A (pixel, Gaussian) pair with alpha below this is skipped: 8-bit images cannot show it. 0 skips none."""
     max_alpha: float = 0.999
     """Alpha is limited to this, so that transmittance never reaches 0 and gradients stay finite."""
     min_transmittance: float = 1e-4
     """A pixel stops before the Gaussian that would bring its transmittance to this or less. 0 never stops."""
     antialiased: bool = False
-    """Scale opacities by what `eps2d` added to the area (Mip-Splatting): thin Gaussians do not grow brighter."""
+    """Scale opacities by what `eps2d` added to the area (Mip-Splatting): thin ones do not grow brighter."""

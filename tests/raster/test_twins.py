@@ -137,11 +137,7 @@ class FakeGsplat:
     ):
         assert not packed
         settings = RasterSettings(
-            near_plane=near_plane,
-            far_plane=far_plane,
-            radius_clip=radius_clip,
-            eps2d=eps2d,
-            tile_size=tile_size,
+            **{name: call.pop(name) for name in rules},
             antialiased=rasterize_mode == "antialiased",
         )
         return rasterization(**call, settings=settings, backend="torch")
