@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -42,9 +41,9 @@ def rasterization(
 
     Names, shapes and rules are gsplat's. Leading batch axes "..." broadcast: an input without them, or of
     size 1 along all of them, is shared by all batch entries without being copied, and its gradient is the sum
-    over them. Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds; Ks gets none.
-    The result is the same, bit for bit, for any number of threads (`RAYON_NUM_THREADS`). Call it in the main
-    process only: a forked worker has no threads.
+    over them. Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds; Ks gets
+    none. The result is the same, bit for bit, for any number of threads (`RAYON_NUM_THREADS`). Call it in the
+    main process only: a forked worker has no threads.
 
     Args:
         means: centres in the world, metres.
@@ -65,9 +64,9 @@ def rasterization(
             gsplat for CUDA tensors.
 
     Returns:
-        Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1], and
-        info: means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N] (zeros for a Gaussian
-        that no pixel sees), tile_size, and from the rust backend n_isects, n_visible and n_empty_tiles.
+        Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1] and
+        info: means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N] (zeros for a
+        Gaussian that no pixel sees), tile_size, and from the rust backend n_isects, n_visible, n_empty_tiles.
 
     Raises:
         InputError: a shape, dtype, value or camera that cannot be rendered.

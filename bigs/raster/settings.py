@@ -20,7 +20,7 @@ class RasterSettings:
     radius_clip: float = 0.0
     """Gaussians whose radii on screen are both at most this many pixels are skipped; 0 keeps all."""
     alpha_threshold: float = 1.0 / 255.0
-    """A (pixel, Gaussian) pair with alpha below this is skipped: 8-bit images cannot show it. 0 skips none."""
+    """A (pixel, Gaussian) pair with alpha below this is skipped: 8 bits cannot show it. 0 skips none."""
     max_alpha: float = 0.999
     """Alpha is limited to this, so that transmittance never reaches 0 and gradients stay finite."""
     min_transmittance: float = 1e-4

@@ -136,6 +136,7 @@ class FakeGsplat:
         self, *, near_plane, far_plane, radius_clip, eps2d, tile_size, rasterize_mode, packed, **call
     ):
         assert not packed
+        rules = ("near_plane", "far_plane", "radius_clip", "eps2d", "tile_size")
         settings = RasterSettings(
             **{name: call.pop(name) for name in rules},
             antialiased=rasterize_mode == "antialiased",
