@@ -132,9 +132,7 @@ def test_gsplat_is_named_when_missing():
 class FakeGsplat:
     """Stands in for the CUDA library: same call, rendered by the twin."""
 
-    def rasterization(
-        self, *, near_plane, far_plane, radius_clip, eps2d, tile_size, rasterize_mode, packed, **call
-    ):
+    def rasterization(self, *, rasterize_mode, packed, **call):
         assert not packed
         rules = ("near_plane", "far_plane", "radius_clip", "eps2d", "tile_size")
         settings = RasterSettings(
