@@ -4,6 +4,7 @@ from bigs.hand.io import load_hand_model, load_hand_models
 from bigs.hand.lbs import blend_transforms, skin_points
 from bigs.hand.mirror import mirror_axis_angle, mirror_points, mirror_rotation, shared_betas
 from bigs.hand.model import JOINT_NAMES, MANO_PARENTS, HandModel, HandOutput
+from bigs.hand.procedural import procedural_hand
 
 __all__ = [
     "JOINT_NAMES",
@@ -16,6 +17,7 @@ __all__ = [
     "mirror_axis_angle",
     "mirror_points",
     "mirror_rotation",
+    "procedural_hand",
     "shared_betas",
     "skin_points",
 ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from bigs.checks import InputError, check_choice, check_finite, check_shape
 from bigs.hand.model import MANO_PARENTS, HandModel
+from bigs.hand.procedural import procedural_hand
 from bigs.types import SIDES, Side
 
 FILE_STEMS: dict[Side, str] = {"right": "MANO_RIGHT", "left": "MANO_LEFT"}
@@ -37,12 +38,15 @@ def load_hand_models(path: str | Path | None) -> dict[Side, HandModel]:
     """Both hands from a folder of model files, or the built-in hand.
 
     Args:
-        path: a folder holding MANO_RIGHT and, optionally, MANO_LEFT as .npz or .pkl; a right-hand file; or None
-            for the procedural hand. Without a left file the left hand is the mirrored right hand.
+        path: a folder holding MANO_RIGHT and, optionally, MANO_LEFT as .npz or .pkl; a right-hand file; or
+            None for the procedural hand. Without a left file the left hand is the mirrored right hand.
 
     Raises:
         InputError: a file is missing or is not a valid hand model.
     """
+    if path is None:
+        right = procedural_hand("right")
+        return {"right": right, "left": right.mirrored()}
     right = load_hand_model(path, "right")
     left_file = find_model_file(Path(path), "left") if Path(path).is_dir() else None
     return {"right": right, "left": load_hand_model(left_file, "left") if left_file else right.mirrored()}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def shape_vertices(template: Tensor, shapedirs: Tensor, betas: Tensor) -> Tensor:
-    """Rest vertices [..., V, 3] of shape `betas` [..., S], from `template` [V, 3] and `shapedirs` [V, 3, S]."""
+    """Rest vertices [..., V, 3]: `template` [V, 3] plus `shapedirs` [V, 3, S] times `betas` [..., S]."""
     offsets = betas @ shapedirs.reshape(-1, shapedirs.shape[-1]).T
     return template + offsets.reshape(*betas.shape[:-1], *template.shape)
 

@@ -33,9 +33,9 @@ def shared_betas(right: HandModel, left: HandModel, betas_left: Tensor) -> Tenso
     """The right hand's shape whose mirror image is nearest to the left model's shape `betas_left`.
 
     Nearest in least squares over vertices relative to the wrist joint, since a posed hand is placed by its
-    wrist. When the left file is the mirrored right file this is `betas_left` itself. MANO_LEFT has the x part of
-    its shape directions with the right hand's sign; ARCTIC's and HOLD's shapes were fitted to it as it is, so the
-    sign is not corrected: this gives the right hand's shape that looks most like what they fitted.
+    wrist. When the left file is the mirrored right file this is `betas_left` itself. MANO_LEFT has the x part
+    of its shape directions with the right hand's sign; ARCTIC's and HOLD's shapes were fitted to it as it is,
+    so the sign is not corrected: this gives the right hand's shape that looks most like what they fitted.
 
     Args:
         right: a right hand.
