@@ -143,7 +143,7 @@ def write_hold(
         "cameras": {
             key: value
             for t in range(len(frame_names))
-            for key, value in ((f"scale_mat_{t}", scale_mat), (f"world_mat_{t}", world_mat))
+            for key, value in ((f"scale_mat_{t}", scale_mat.copy()), (f"world_mat_{t}", world_mat.copy()))
         },
         "scene_bounding_sphere": SCENE_BOUNDING_SPHERE,
         "max_radius_ratio": MAX_RADIUS_RATIO,

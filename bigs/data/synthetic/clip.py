@@ -26,7 +26,7 @@ from bigs.data.synthetic.objects import (
     make_object,
     surface_normals,
 )
-from bigs.data.synthetic.raycast import Body, Picture, take_picture
+from bigs.data.synthetic.raycast import Body, Picture, require_embree, take_picture
 from bigs.data.synthetic.texture import fingernails, skin_tone
 from bigs.geometry.mesh import face_areas, vertex_normals
 from bigs.types import MASK_VALUES, SIDES, Side
@@ -75,6 +75,7 @@ def make_clip(
         raise InputError(
             f"synthetic clip: expected at least 4 frames of 32 x 32, found {frames} of {width} x {height}"
         )
+    require_embree()
     folder = Path(folder)
     streams = _Streams(seed)
     solid = make_object(object)
@@ -115,6 +116,8 @@ def make_clip(
         normalize_shift=shift,
         hands={side: _hand_track(hand_models[side], guess, shift) for side, guess in hand_guesses.items()},
         object=object_track,
+        # torch pickles the tensor's address; without it the files are the same bytes every time.
+        torch_norm_mat=False,
     )
     arrays: dict[str, Any] = {"K": K, "wh": np.array([width, height]), "fps": FPS}
     arrays |= _object_truth(object_guess, rotations, positions)

@@ -25,7 +25,7 @@ _MAX_BEND = np.array([1.45, 1.65, 1.1])
 PRESS = 0.0007
 # A MANO hand lies palm down.
 _PALM = np.array([0.0, -1.0, 0.0])
-_STEPS = 20
+_STEPS = 16
 # The joints whose vertices meet the object first when a flat hand is pressed to it.
 _PALM_SIDE = (0, 1, 4, 7, 10, 13)
 
@@ -142,7 +142,7 @@ class _Search:
         Returns:
             Finger rotations [15, 3] and the wrist's position [3].
         """
-        parts, swings = (a.ravel() for a in np.meshgrid(np.linspace(0.6, 0.95, 6), np.linspace(0.3, 0.95, 6)))
+        parts, swings = (a.ravel() for a in np.meshgrid(np.linspace(0.6, 0.95, 5), np.linspace(0.3, 0.95, 5)))
         fingers = np.zeros((len(parts), 15, 3))
         fingers[:, FINGERS["thumb"][0] - 1] = [self.thumb_swing(share) for share in swings]
         offsets = (parts[:, None] * (self.joints[4] - self.joints[0])) @ self.rotation.T
@@ -190,7 +190,7 @@ class _Search:
         rows = np.array(FINGERS["thumb"]) - 1
         toward = self.joints[4] - self.joints[0]
         best, best_score = fingers, np.inf
-        for share in np.linspace(0.2, 1.0, 9):
+        for share in np.linspace(0.2, 1.0, 7):
             swing = Rotation.from_rotvec(self.thumb_swing(share))
             trial = fingers.copy()
             trial[rows[0]] = swing.as_rotvec()

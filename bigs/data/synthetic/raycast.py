@@ -39,8 +39,8 @@ class Picture:
     depth: np.ndarray  # [H, W] metres along z at pixel centres, inf where there is none
 
 
-def intersector(mesh: trimesh.Trimesh) -> Any:
-    """Embree's ray caster for `mesh`.
+def require_embree() -> type:
+    """The class of Embree's ray casters, made from a mesh each.
 
     Raises:
         InputError: the package embreex is not installed.
@@ -51,7 +51,7 @@ def intersector(mesh: trimesh.Trimesh) -> Any:
         raise InputError(
             "synthetic clips: expected the package embreex (pip install bigs[synthetic]), found none"
         ) from None
-    return RayMeshIntersector(mesh)
+    return RayMeshIntersector
 
 
 def take_picture(bodies: list[Body], K: np.ndarray, background: np.ndarray) -> Picture:
@@ -68,7 +68,7 @@ def take_picture(bodies: list[Body], K: np.ndarray, background: np.ndarray) -> P
     mask = np.zeros((height, width), dtype=np.uint8)
     color = np.repeat(np.repeat(background, _SAMPLES, axis=0), _SAMPLES, axis=1)
     for body in bodies:
-        caster = intersector(trimesh.Trimesh(body.verts, body.faces, process=False))
+        caster = require_embree()(trimesh.Trimesh(body.verts, body.faces, process=False))
         hit = center.nearer(body, caster)
         mask[hit.rows, hit.columns] = body.label
         hit = fine.nearer(body, caster)

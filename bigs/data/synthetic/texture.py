@@ -13,8 +13,9 @@ def solid_noise(points: np.ndarray, cell: float, seed: int) -> np.ndarray:
     t = t * t * (3 - 2 * t)
     sides = (1 - t).T, t.T
     total = np.zeros(len(points))
-    for i, j, k in np.ndindex(2, 2, 2):
-        total += sides[i][0] * sides[j][1] * sides[k][2] * _hash(base + (i, j, k), seed)
+    for corner in np.ndindex(2, 2, 2):
+        i, j, k = corner
+        total += sides[i][0] * sides[j][1] * sides[k][2] * _hash(base + corner, seed)
     return total
 
 
