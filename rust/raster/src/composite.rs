@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::dispatch::{self, SimdLevel};
 use crate::kernel::{
-    BLOCK, Channels, LANES, MAX_CHANNELS, MAX_PIXELS, MOMENTS, Scratch, TileCotangents, TileImage,
-    TileTask,
+    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_PIXELS, MOMENTS, TileCotangents,
+    TileImage, TilePlane, TileTask,
 };
 use crate::project::Splat;
 use crate::real::Real;
@@ -122,27 +122,24 @@ pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>) -> Canvas<T> {
     )
         .into_par_iter()
         .enumerate()
-        .for_each_init(
-            Scratch::<T>::default,
-            |scratch, (tile, (masks, colors, transmittance, last))| {
-                if masks.is_empty() {
-                    return;
-                }
-                let mut open = [false; MAX_PIXELS];
-                scene.for_pixels(tile, |p, _| open[p] = true);
-                let mut task = scene.task(tile);
-                while task.first < total {
-                    let out = TileImage {
-                        colors: &mut colors[task.first * pixels..],
-                        transmittance,
-                        last,
-                        masks,
-                    };
-                    dispatch::forward(level, &task, &open, scratch, out);
-                    task.first += MAX_CHANNELS;
-                }
-            },
-        );
+        .for_each(|(tile, (masks, colors, transmittance, last))| {
+            if masks.is_empty() {
+                return;
+            }
+            let mut open = [false; MAX_PIXELS];
+            scene.for_pixels(tile, |p, _| open[p] = true);
+            let mut task = scene.task(tile);
+            while task.first < total {
+                let out = TileImage {
+                    colors: &mut colors[task.first * pixels..],
+                    transmittance,
+                    last,
+                    masks,
+                };
+                dispatch::forward(level, &task, &open, out);
+                task.first += MAX_CHANNELS;
+            }
+        });
     canvas
 }
 
@@ -238,7 +235,7 @@ pub(crate) fn composite_vjp<T: Real>(
                 for k in 0..(total - task.first).min(MAX_CHANNELS) {
                     v_background[task.first + k] = transmittance
                         .iter()
-                        .zip(&v_values[k])
+                        .zip(v_values[k].iter().flat_map(|lanes| &lanes.0))
                         .map(|(&t, &v)| t * v)
                         .sum();
                 }
@@ -273,8 +270,6 @@ pub(crate) fn composite_vjp<T: Real>(
     }
 }
 
-type TilePlanes<T> = [[T; MAX_PIXELS]; MAX_CHANNELS];
-
 /// Gradients of the channels from `first` on and of the transmittance for one tile, and whether any is not zero.
 fn load_cotangents<T: Real>(
     scene: &Scene<'_, T>,
@@ -282,13 +277,13 @@ fn load_cotangents<T: Real>(
     tile: usize,
     first: usize,
     v: Cotangents<'_, T>,
-) -> (TilePlanes<T>, [T; MAX_PIXELS], bool) {
+) -> ([TilePlane<T>; MAX_CHANNELS], TilePlane<T>, bool) {
     let total = scene.channels.total;
     let pixels = scene.grid.pixels_per_tile();
     let used = (total - first).min(MAX_CHANNELS);
     let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
-    let mut v_values = [[T::ZERO; MAX_PIXELS]; MAX_CHANNELS];
-    let mut v_transmittance = [T::ZERO; MAX_PIXELS];
+    let zero = [Lanes::splat(T::ZERO); MAX_BLOCKS];
+    let (mut v_values, mut v_transmittance) = ([zero; MAX_CHANNELS], zero);
     let mut any = false;
     let depth_plane = (tile * total + total - 1) * pixels;
     scene.for_pixels(tile, |p, pixel| {
@@ -305,11 +300,11 @@ fn load_cotangents<T: Real>(
                     v_alpha += -(value * (canvas.colors[depth_plane + p] / alpha));
                 }
             }
-            v_values[k][p] = value;
-            v_transmittance[p] += value * background[k];
+            v_values[k][p / LANES][p % LANES] = value;
+            v_transmittance[p / LANES][p % LANES] += value * background[k];
             any |= value != T::ZERO;
         }
-        v_transmittance[p] += -v_alpha;
+        v_transmittance[p / LANES][p % LANES] += -v_alpha;
         any |= v_alpha != T::ZERO;
     });
     (v_values, v_transmittance, any)

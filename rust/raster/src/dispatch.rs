@@ -5,8 +5,7 @@
 use std::sync::OnceLock;
 
 use crate::kernel::{
-    MAX_CHANNELS, MAX_PIXELS, Scratch, TileCotangents, TileImage, TileTask, backward_tile,
-    forward_tile,
+    MAX_CHANNELS, MAX_PIXELS, TileCotangents, TileImage, TileTask, backward_tile, forward_tile,
 };
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 use crate::real::Fused;
@@ -94,10 +93,9 @@ macro_rules! compiled_for {
             pub(super) fn forward<T: Real, const K: usize>(
                 task: &TileTask<'_, T>,
                 open: &[bool; MAX_PIXELS],
-                scratch: &mut Scratch<T>,
                 out: TileImage<'_, T>,
             ) {
-                forward_tile::<T, Fused, K>(task, open, scratch, out);
+                forward_tile::<T, Fused, K>(task, open, out);
             }
 
             #[target_feature(enable = $features)]
@@ -123,19 +121,18 @@ fn forward_level<T: Real, const K: usize>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     open: &[bool; MAX_PIXELS],
-    scratch: &mut Scratch<T>,
     out: TileImage<'_, T>,
 ) {
     match level {
-        SimdLevel::Baseline => forward_tile::<T, Separate, K>(task, open, scratch, out),
+        SimdLevel::Baseline => forward_tile::<T, Separate, K>(task, open, out),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => forward_tile::<T, Fused, K>(task, open, scratch, out),
+        SimdLevel::Neon => forward_tile::<T, Fused, K>(task, open, out),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx2 => unsafe { avx2::forward::<T, K>(task, open, scratch, out) },
+        SimdLevel::Avx2 => unsafe { avx2::forward::<T, K>(task, open, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { avx512::forward::<T, K>(task, open, scratch, out) },
+        SimdLevel::Avx512 => unsafe { avx512::forward::<T, K>(task, open, out) },
     }
 }
 
@@ -165,15 +162,14 @@ pub(crate) fn forward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     open: &[bool; MAX_PIXELS],
-    scratch: &mut Scratch<T>,
     out: TileImage<'_, T>,
 ) {
     match task.channels.total - task.first {
-        1 => forward_level::<T, 1>(level, task, open, scratch, out),
-        2..=3 => forward_level::<T, 3>(level, task, open, scratch, out),
-        4 => forward_level::<T, 4>(level, task, open, scratch, out),
-        5..=6 => forward_level::<T, 6>(level, task, open, scratch, out),
-        _ => forward_level::<T, MAX_CHANNELS>(level, task, open, scratch, out),
+        1 => forward_level::<T, 1>(level, task, open, out),
+        2..=3 => forward_level::<T, 3>(level, task, open, out),
+        4 => forward_level::<T, 4>(level, task, open, out),
+        5..=6 => forward_level::<T, 6>(level, task, open, out),
+        _ => forward_level::<T, MAX_CHANNELS>(level, task, open, out),
     }
 }
 

@@ -7,6 +7,9 @@
 //! Backward walks splat by splat, back to front, so that a splat's gradient is reduced once per tile, and recomputes
 //! alpha: cheaper than storing it.
 
+use std::hint::select_unpredictable as select;
+use std::ops::{Index, IndexMut};
+
 use crate::project::Splat;
 use crate::real::{Arithmetic, Real};
 use crate::settings::Limits;
@@ -25,7 +28,32 @@ pub(crate) const MOMENTS: usize = 6;
 /// Most channels composited at once.
 pub(crate) const MAX_CHANNELS: usize = 8;
 
-type Lanes<T> = [T; LANES];
+/// One value per pixel of a block, where a vector register finds it: a load that straddles two cache lines is slow.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+pub(crate) struct Lanes<T>(pub(crate) [T; LANES]);
+
+impl<T: Copy> Lanes<T> {
+    #[inline(always)]
+    pub(crate) fn splat(value: T) -> Self {
+        Self([value; LANES])
+    }
+}
+
+impl<T> Index<usize> for Lanes<T> {
+    type Output = T;
+    #[inline(always)]
+    fn index(&self, lane: usize) -> &T {
+        &self.0[lane]
+    }
+}
+
+impl<T> IndexMut<usize> for Lanes<T> {
+    #[inline(always)]
+    fn index_mut(&mut self, lane: usize) -> &mut T {
+        &mut self.0[lane]
+    }
+}
 
 /// Where the values of channels come from: the caller's colours, then camera z.
 #[derive(Clone, Copy)]
@@ -69,6 +97,21 @@ pub(crate) struct Entry<T, const K: usize> {
     values: [T; K],
 }
 
+impl<T: Real, const K: usize> Default for Entry<T, K> {
+    fn default() -> Self {
+        let [x, y, w11, w12, w22, opacity] = [T::ZERO; 6];
+        Self {
+            x,
+            y,
+            w11,
+            w12,
+            w22,
+            opacity,
+            values: [T::ZERO; K],
+        }
+    }
+}
+
 impl<T: Real, const K: usize> Entry<T, K> {
     #[inline(always)]
     fn load(task: &TileTask<'_, T>, rank: u32) -> (Self, T) {
@@ -101,8 +144,8 @@ impl<T: Real, const K: usize> Entry<T, K> {
 #[inline(always)]
 fn lane_centres<T: Real>() -> (Lanes<T>, Lanes<T>) {
     (
-        std::array::from_fn(|i| T::of((i % BLOCK) as f64 + 0.5)),
-        std::array::from_fn(|i| T::of((i / BLOCK) as f64 + 0.5)),
+        Lanes(std::array::from_fn(|i| T::of((i % BLOCK) as f64 + 0.5))),
+        Lanes(std::array::from_fn(|i| T::of((i / BLOCK) as f64 + 0.5))),
     )
 }
 
@@ -127,8 +170,12 @@ impl<T: Real> BlockCentres<T> {
     #[inline(always)]
     fn new(side: usize) -> Self {
         Self {
-            x: std::array::from_fn(|b| T::of((b % side * BLOCK) as f64 + 0.5)),
-            y: std::array::from_fn(|b| T::of((b / side * BLOCK) as f64 + 0.5)),
+            x: Lanes(std::array::from_fn(|b| {
+                T::of((b % side * BLOCK) as f64 + 0.5)
+            })),
+            y: Lanes(std::array::from_fn(|b| {
+                T::of((b / side * BLOCK) as f64 + 0.5)
+            })),
             mask: ((1u32 << (side * side)) - 1) as u16,
         }
     }
@@ -170,21 +217,6 @@ fn reached_blocks<T: Real, A: Arithmetic, const K: usize>(
     mask as u16 & centres.mask
 }
 
-/// Scratch of one task, reused from tile to tile.
-pub(crate) struct Scratch<T> {
-    lists: [Vec<u32>; MAX_BLOCKS],
-    marker: std::marker::PhantomData<T>,
-}
-
-impl<T> Default for Scratch<T> {
-    fn default() -> Self {
-        Self {
-            lists: Default::default(),
-            marker: std::marker::PhantomData,
-        }
-    }
-}
-
 /// What forward leaves of a tile; pixels in block order.
 pub(crate) struct TileImage<'a, T> {
     /// Channel-major: channel k of pixel p is `colors[k · pixels + p]`, for the channels handled now.
@@ -197,83 +229,141 @@ pub(crate) struct TileImage<'a, T> {
     pub(crate) masks: &'a mut [u16],
 }
 
+/// Splats loaded and composited at once: few enough to stay in the first cache, and a tile that is spent loads no more.
+const BATCH: usize = 128;
+/// Splats composited between two looks at whether a block is spent.
+const STRIDE: usize = 8;
+
+/// A block of pixels while light goes through it.
+#[derive(Clone, Copy)]
+struct Light<T, const K: usize> {
+    /// Transmittance of a pixel that still takes light, 0 for one that has stopped.
+    live: Lanes<T>,
+    transmittance: Lanes<T>,
+    last: Lanes<u32>,
+    sums: [Lanes<T>; K],
+}
+
+impl<T: Real, const K: usize> Light<T, K> {
+    #[inline(always)]
+    fn spent(&self) -> bool {
+        let mut taking = 0;
+        for t in self.live.0 {
+            taking += u32::from(t > T::ZERO);
+        }
+        taking == 0
+    }
+}
+
 /// Composites one tile. `open` says which pixels are to be rendered.
 #[inline(always)]
 pub(crate) fn forward_tile<T: Real, A: Arithmetic, const K: usize>(
     task: &TileTask<'_, T>,
     open: &[bool; MAX_PIXELS],
-    scratch: &mut Scratch<T>,
     out: TileImage<'_, T>,
 ) {
     let blocks = task.side * task.side;
     let pixels = blocks * LANES;
     let centres = BlockCentres::<T>::new(task.side);
-    let mut entries: Vec<Entry<T, K>> = Vec::with_capacity(task.ranks.len());
-    for list in &mut scratch.lists {
-        list.clear();
-    }
-    for (index, &rank) in task.ranks.iter().enumerate() {
-        let (entry, reach) = Entry::load(task, rank);
-        let mask = reached_blocks::<T, A, K>(&entry, padded_reach(reach), &centres);
-        out.masks[index] = mask;
-        entries.push(entry);
-        let mut rest = mask;
-        while rest != 0 {
-            scratch.lists[rest.trailing_zeros() as usize].push(index as u32);
-            rest &= rest - 1;
-        }
-    }
-
     let (lane_x, lane_y) = lane_centres::<T>();
     let (threshold, max_alpha, stop) = (
         task.limits.alpha_threshold,
         task.limits.max_alpha,
         task.limits.min_transmittance,
     );
+    let mut lights = [Light {
+        live: Lanes::splat(T::ZERO),
+        transmittance: Lanes::splat(T::ONE),
+        last: Lanes::splat(0u32),
+        sums: [Lanes::splat(T::ZERO); K],
+    }; MAX_BLOCKS];
+    let mut taking: u16 = 0;
     for block in 0..blocks {
-        let (corner_x, corner_y) = block_corner::<T>(block, task.side);
-        let first = block * LANES;
-        // `live` is the transmittance of a pixel that still takes light and 0 for one that has stopped.
-        let mut live: Lanes<T> =
-            std::array::from_fn(|i| if open[first + i] { T::ONE } else { T::ZERO });
-        let mut transmittance: Lanes<T> = [T::ONE; LANES];
-        let mut last = [0u32; LANES];
-        let mut sums: [Lanes<T>; K] = [[T::ZERO; LANES]; K];
-        for chunk in scratch.lists[block].chunks(8) {
-            if live.iter().filter(|&&t| t > T::ZERO).count() == 0 {
-                break;
+        for i in 0..LANES {
+            lights[block].live[i] = if open[block * LANES + i] {
+                T::ONE
+            } else {
+                T::ZERO
+            };
+        }
+        taking |= u16::from(!lights[block].spent()) << block;
+    }
+
+    let mut entries = [Entry::<T, K>::default(); BATCH];
+    for (batch, (ranks, masks)) in task
+        .ranks
+        .chunks(BATCH)
+        .zip(out.masks.chunks_mut(BATCH))
+        .enumerate()
+    {
+        for (index, &rank) in ranks.iter().enumerate() {
+            let (entry, reach) = Entry::load(task, rank);
+            masks[index] = reached_blocks::<T, A, K>(&entry, padded_reach(reach), &centres);
+            entries[index] = entry;
+        }
+        let mut rest = taking;
+        while rest != 0 {
+            let block = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            // The block's own list, appended to without branches.
+            let mut list = [0u8; BATCH];
+            let mut length = 0;
+            for (index, mask) in masks.iter().enumerate() {
+                list[length & (BATCH - 1)] = index as u8;
+                length += usize::from((mask >> block) & 1);
             }
-            for &index in chunk {
-                let entry = entries[index as usize];
-                let (x, y) = (entry.x - corner_x, entry.y - corner_y);
-                for i in 0..LANES {
-                    let dx = lane_x[i] - x;
-                    let dy = lane_y[i] - y;
-                    let u = A::mul_add(entry.w11, dx, entry.w12 * dy);
-                    let v = entry.w22 * dy;
-                    let falloff = (-A::mul_add(u, u, v * v)).exp2_of_nonpositive::<A>();
-                    let alpha = (entry.opacity * falloff).lesser(max_alpha);
-                    let hit = alpha >= threshold;
-                    let weight = if hit { alpha * live[i] } else { T::ZERO };
-                    let next = live[i] - weight;
-                    let on = next > stop;
-                    let weight = if on { weight } else { T::ZERO };
-                    live[i] = if on { next } else { T::ZERO };
-                    transmittance[i] = if on { next } else { transmittance[i] };
-                    last[i] = if on & hit { index + 1 } else { last[i] };
-                    for k in 0..K {
-                        sums[k][i] = A::mul_add(weight, entry.values[k], sums[k][i]);
+            let (corner_x, corner_y) = block_corner::<T>(block, task.side);
+            let mut light = lights[block];
+            for chunk in list[..length].chunks(STRIDE) {
+                for &index in chunk {
+                    let entry = entries[usize::from(index) & (BATCH - 1)];
+                    let place = (batch * BATCH + usize::from(index) + 1) as u32;
+                    let (x, y) = (entry.x - corner_x, entry.y - corner_y);
+                    for i in 0..LANES {
+                        let dx = lane_x[i] - x;
+                        let dy = lane_y[i] - y;
+                        let u = A::mul_add(entry.w11, dx, entry.w12 * dy);
+                        let v = entry.w22 * dy;
+                        let falloff = (-A::mul_add(u, u, v * v)).exp2_of_nonpositive::<A>();
+                        let alpha = (entry.opacity * falloff).lesser(max_alpha);
+                        let hit = alpha >= threshold;
+                        let weight = select(hit, alpha * light.live[i], T::ZERO);
+                        let next = light.live[i] - weight;
+                        let on = next > stop;
+                        let weight = select(on, weight, T::ZERO);
+                        light.live[i] = select(on, next, T::ZERO);
+                        light.transmittance[i] = select(on, next, light.transmittance[i]);
+                        light.last[i] = select(on & hit, place, light.last[i]);
+                        for k in 0..K {
+                            light.sums[k][i] =
+                                A::mul_add(weight, entry.values[k], light.sums[k][i]);
+                        }
                     }
                 }
+                if light.spent() {
+                    taking &= !(1 << block);
+                    break;
+                }
             }
+            lights[block] = light;
         }
-        out.transmittance[first..first + LANES].copy_from_slice(&transmittance);
-        out.last[first..first + LANES].copy_from_slice(&last);
-        for (plane, sum) in out.colors.chunks_exact_mut(pixels).zip(&sums) {
-            plane[first..first + LANES].copy_from_slice(sum);
+        if taking == 0 {
+            break;
+        }
+    }
+
+    for (block, light) in lights[..blocks].iter().enumerate() {
+        let first = block * LANES;
+        out.transmittance[first..first + LANES].copy_from_slice(&light.transmittance.0);
+        out.last[first..first + LANES].copy_from_slice(&light.last.0);
+        for (plane, sum) in out.colors.chunks_exact_mut(pixels).zip(&light.sums) {
+            plane[first..first + LANES].copy_from_slice(&sum.0);
         }
     }
 }
+
+/// One value per pixel of a tile.
+pub(crate) type TilePlane<T> = [Lanes<T>; MAX_BLOCKS];
 
 /// What backward needs of a tile's pixels, in block order.
 pub(crate) struct TileCotangents<'a, T> {
@@ -281,14 +371,14 @@ pub(crate) struct TileCotangents<'a, T> {
     pub(crate) last: &'a [u32],
     pub(crate) masks: &'a [u16],
     /// Gradients of the channels handled now, channel-major.
-    pub(crate) v_values: &'a [[T; MAX_PIXELS]; MAX_CHANNELS],
+    pub(crate) v_values: &'a [TilePlane<T>; MAX_CHANNELS],
     /// Gradient of the final transmittance, from alpha and background.
-    pub(crate) v_transmittance: &'a [T; MAX_PIXELS],
+    pub(crate) v_transmittance: &'a TilePlane<T>,
 }
 
 #[inline(always)]
 fn horizontal_sum<T: Real>(lanes: &Lanes<T>) -> T {
-    let mut sums = *lanes;
+    let mut sums = lanes.0;
     let mut width = LANES / 2;
     while width > 0 {
         for i in 0..width {
@@ -312,17 +402,17 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
     let used = (task.channels.total - task.first).min(K);
     let (lane_x, lane_y) = lane_centres::<T>();
     let mut block_last = [0u32; MAX_BLOCKS];
-    let mut transmittance = [[T::ONE; LANES]; MAX_BLOCKS];
+    let mut transmittance = [Lanes::splat(T::ONE); MAX_BLOCKS];
     // Σ over what lies behind of weight · value · v, plus the background's part: what occlusion takes away.
-    let mut behind = [[T::ZERO; LANES]; MAX_BLOCKS];
-    let mut last = [[0u32; LANES]; MAX_BLOCKS];
+    let mut behind = [Lanes::splat(T::ZERO); MAX_BLOCKS];
+    let mut last = [Lanes::splat(0u32); MAX_BLOCKS];
     for block in 0..blocks {
         for i in 0..LANES {
             let p = block * LANES + i;
             last[block][i] = pixels.last[p];
             block_last[block] = block_last[block].max(pixels.last[p]);
             transmittance[block][i] = pixels.transmittance[p];
-            behind[block][i] = pixels.transmittance[p] * pixels.v_transmittance[p];
+            behind[block][i] = pixels.transmittance[p] * pixels.v_transmittance[block][i];
         }
     }
     let deepest = block_last.iter().copied().max().unwrap_or(0);
@@ -334,8 +424,8 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
             continue;
         }
         let (entry, _) = Entry::<T, K>::load(task, task.ranks[index as usize]);
-        let mut moments: [Lanes<T>; MOMENTS] = [[T::ZERO; LANES]; MOMENTS];
-        let mut v_values: [Lanes<T>; K] = [[T::ZERO; LANES]; K];
+        let mut moments: [Lanes<T>; MOMENTS] = [Lanes::splat(T::ZERO); MOMENTS];
+        let mut v_values: [Lanes<T>; K] = [Lanes::splat(T::ZERO); K];
         while rest != 0 {
             let block = rest.trailing_zeros() as usize;
             rest &= rest - 1;
@@ -344,11 +434,7 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
             }
             let (corner_x, corner_y) = block_corner::<T>(block, task.side);
             let (x, y) = (entry.x - corner_x, entry.y - corner_y);
-            let v_pixels: [&Lanes<T>; K] = std::array::from_fn(|k| {
-                pixels.v_values[k][block * LANES..]
-                    .first_chunk()
-                    .expect("a tile has whole blocks")
-            });
+            let v_pixels: [&Lanes<T>; K] = std::array::from_fn(|k| &pixels.v_values[k][block]);
             let (transmittance, behind, last) =
                 (&mut transmittance[block], &mut behind[block], &last[block]);
             for i in 0..LANES {
@@ -360,8 +446,8 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
                 let raw = entry.opacity * falloff;
                 let limited = raw.lesser(max_alpha);
                 let on = (limited >= threshold) & (index < last[i]);
-                let alpha = if on { limited } else { T::ZERO };
-                let reciprocal = T::ONE / (T::ONE - alpha);
+                let alpha = select(on, limited, T::ZERO);
+                let reciprocal = (T::ONE - alpha).reciprocal::<A>();
                 let before = transmittance[i] * reciprocal;
                 let weight = alpha * before;
                 let mut value = entry.values[0] * v_pixels[0][i];
