@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, list_frames, read_image, read_mask
+from bigs.data.projection import CAMERA_TOLERANCE, decompose_projection
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.types import ENTITIES, MASK_VALUES, SIDES, Entity, Side
 from bigs.unpickle import load_npy
@@ -31,11 +31,6 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 # HOLD's defaults; together they make the scaled space's unit half the camera's distance from the origin.
 SCENE_BOUNDING_SPHERE = 6.0
 MAX_RADIUS_RATIO = 3.0
-
-# world_mat is kept in float32, so the camera it holds is known to about seven digits.
-_CAMERA_TOLERANCE = 1e-4
-# A focal length below this fraction of the image width sees more than 179.8 degrees: a broken file.
-_MIN_FOCAL = 1e-3
 
 
 def load_hold(path: str | Path) -> Clip:
@@ -168,7 +163,11 @@ def _sequence_name(folder: Path) -> str:
 def _frame_names(file: Path, image_paths: Sequence[Path]) -> tuple[str, ...]:
     if not file.is_file():
         return tuple(path.name for path in image_paths)
-    names = tuple(line.strip() for line in file.read_text().splitlines() if line.strip())
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: expected a text file of frame names, found {error}") from None
+    names = tuple(line.strip() for line in lines if line.strip())
     if len(names) != len(image_paths):
         raise InputError(
             f"{file}: expected one line for each of {len(image_paths)} images, found {len(names)}"
@@ -211,12 +210,13 @@ def _read_cameras(
     stored = sum(1 for key in cameras if re.fullmatch(r"world_mat_\d+", str(key)))
     if stored != frames:
         raise InputError(f"{where}: expected a world_mat for each of {frames} images, found {stored}")
-    intrinsics, extrinsics = [], []
+    intrinsics: list[np.ndarray] = []
+    extrinsics: list[np.ndarray] = []
     for t in range(frames):
         matrix = f"{where}.world_mat_{t}"
         world_mat = array_field(matrix, require(matrix, cameras, f"world_mat_{t}"), (4, 4))
-        K, cam_from_world = _decompose_camera(matrix, world_mat, width)
-        if t and not np.allclose(K, intrinsics[0], rtol=0, atol=_CAMERA_TOLERANCE * width):
+        K, cam_from_world = decompose_projection(matrix, world_mat, width)
+        if t and not np.allclose(K, intrinsics[0], rtol=0, atol=CAMERA_TOLERANCE * width):
             expected, found = (np.array2string(k, precision=6).replace("\n", "") for k in (intrinsics[0], K))
             raise InputError(f"{matrix}: expected the intrinsics of world_mat_0 {expected}, found {found}")
         intrinsics.append(K)
@@ -228,39 +228,6 @@ def _read_cameras(
     if radius <= 0 or not np.allclose(scale_mat, np.diag([radius, radius, radius, 1.0])):
         raise InputError(f"{matrix}: expected diag(m, m, m, 1) with m > 0, found {scale_mat.tolist()}")
     return intrinsics[0], np.stack(extrinsics), 1.0 / radius
-
-
-def _decompose_camera(where: str, world_mat: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Split P = K [R | t] into K [3, 3] and [R | t] as [4, 4]."""
-    depth_scale = np.linalg.norm(world_mat[2, :3])
-    if depth_scale == 0 or not np.allclose(world_mat[3], [0, 0, 0, 1]):
-        raise InputError(
-            f"{where}: expected the last rows to be a viewing direction and (0, 0, 0, 1), "
-            f"found {world_mat[2:].tolist()}"
-        )
-    projection = world_mat[:3] / depth_scale
-    K, R = rq(projection[:, :3])
-    signs = np.sign(np.diag(K))
-    signs[signs == 0] = 1
-    K, R = K * signs, signs[:, None] * R
-    focal = K[[0, 1], [0, 1]]
-    if focal.min() < _MIN_FOCAL * width:
-        raise InputError(
-            f"{where}: expected positive focal lengths, found {focal[0]:.3g} and {focal[1]:.3g} pixels"
-        )
-    if np.linalg.det(R) < 0:
-        raise InputError(
-            f"{where}: expected K times a rigid motion, found a mirrored one (negative determinant)"
-        )
-    if abs(K[0, 1]) > _CAMERA_TOLERANCE * width:
-        raise InputError(
-            f"{where}: expected K without skew times a rigid motion, found a skew of {K[0, 1]:.3g} pixels"
-        )
-    K[0, 1] = 0.0
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = R
-    cam_from_world[:3, 3] = np.linalg.solve(K, projection[:, 3])
-    return K, cam_from_world
 
 
 def _read_hand(where: str, entity: Any, frames: int) -> HandTrack:

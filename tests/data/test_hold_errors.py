@@ -48,6 +48,12 @@ def test_missing_frame(write_small: Callable[..., Path], remove: str, names: str
     assert names in text and str(FRAMES) in text and str(FRAMES - 1) in text
 
 
+def test_names_that_are_not_text(write_small: Callable[..., Path]) -> None:
+    folder = write_small()
+    (folder / "build" / "corres.txt").write_bytes(b"\xff\xfe\x00")
+    assert "corres.txt" in message(folder)
+
+
 def test_mask_with_another_name(write_small: Callable[..., Path]) -> None:
     folder = write_small()
     (folder / "build" / "mask" / "0004.png").rename(folder / "build" / "mask" / "0005.png")

@@ -78,11 +78,11 @@ def carry_hand(
     frames = len(rotations)
     axes = bend_axes(rest_joints(model, betas))
     fingers = np.repeat(grasp.fingers[None], frames, axis=0)
-    for name, joints in FINGERS.items():
+    for name, numbers in FINGERS.items():
         if name == "thumb":
             continue
         lift = _LIFT * np.clip(smooth_noise(rng, frames, 1)[:, 0], 0, 1)
-        rows = np.array(joints) - 1
+        rows = np.array(numbers) - 1
         # Opening only: a finger never goes deeper than where it touched.
         fingers[:, rows[0]] -= lift[:, None] * axes[rows[0]]
     hand_rotations = rotations @ grasp.rotation

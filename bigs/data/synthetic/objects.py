@@ -50,8 +50,8 @@ def make_object(kind: ObjectKind) -> SolidObject:
     """The object of that name."""
     distance, albedo, half, holds = _RECIPES[kind]
     verts, faces = _cut_mesh(distance, np.array(half) + 4 * _MESH_CELL)
-    mesh = trimesh.Trimesh(verts, faces, process=False)
-    mesh.visual.vertex_colors = (albedo(verts) * 255).round().astype(np.uint8)
+    colors = (albedo(verts) * 255).round().astype(np.uint8)
+    mesh = trimesh.Trimesh(verts, faces, vertex_colors=colors, process=False)
     return SolidObject(distance, albedo, mesh, surface_normals(distance, verts), holds)
 
 
