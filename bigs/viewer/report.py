@@ -1,0 +1,156 @@
+"""`report.html`: one file with pictures, video, scores, curves and timings, that opens without a network."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from bigs.atomic import atomic_write
+from bigs.checks import InputError
+from bigs.viewer.plot import line_plot
+
+_JPEG_QUALITY = 88
+# Keys of a log row that say where it belongs and are no curves themselves.
+_POSITION_KEYS = ("stage", "step", "steps", "time")
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; }
+img, video { max-width: 100%; height: auto; }
+figure { margin: 1em 0; } figcaption { opacity: .75; }
+table { border-collapse: collapse; } th, td { padding: .2em .9em; border-bottom: 1px solid #8886; }
+td { text-align: right; font-variant-numeric: tabular-nums; } th, td:first-child { text-align: left; }
+.curves { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 1em; }
+svg text { font: 10px system-ui, sans-serif; fill: currentColor; }
+svg .name { font-weight: bold; font-size: 12px; }
+svg path { fill: none; } svg .axis { stroke: currentColor; } svg .grid { stroke: #8883; }
+svg .border { stroke: #888; stroke-dasharray: 3 3; } svg .curve { stroke: #2a7de1; stroke-width: 1.5; }
+"""
+
+
+def write_report(
+    path: str | Path,
+    *,
+    title: str,
+    facts: Mapping[str, str] | None = None,
+    pictures: Mapping[str, Image.Image] | None = None,
+    video: str | Path | None = None,
+    metrics: Sequence[Sequence[str]] = (),
+    log: Sequence[Mapping[str, Any]] = (),
+    timings: Mapping[str, float] | None = None,
+    skipped: Sequence[str] = (),
+) -> None:
+    """Write the report; `path` is whole or absent. Parts that are empty are left out.
+
+    Args:
+        path: the .html file.
+        title: its heading.
+        facts: what the run was: name -> value.
+        pictures: caption -> picture.
+        video: an .mp4 file, embedded as it is.
+        metrics: a table of text, the first row its heading, as `bigs.metrics.report.comparison_table` makes
+            it.
+        log: rows in the order they were logged: "stage" (text, optional), "step" (steps done in that stage),
+            and numbers; dictionaries of numbers count as numbers of their own. Every number becomes a curve
+            over all stages; what is neither is passed over.
+        timings: name -> seconds.
+        skipped: what was not done, one sentence each with its reason.
+
+    Raises:
+        InputError: there is no such video.
+    """
+    parts = [f"<h1>{escape(title)}</h1>"]
+    if facts:
+        parts.append(_table([("", ""), *facts.items()]))
+    if metrics:
+        parts += ["<h2>Scores</h2>", _table(metrics)]
+    for caption, picture in (pictures or {}).items():
+        source = _embedded(_jpeg(picture), "image/jpeg")
+        name = escape(caption)
+        parts.append(f'<figure><img src="{source}" alt="{name}"><figcaption>{name}</figcaption></figure>')
+    if video is not None:
+        if not Path(video).is_file():
+            raise InputError(f"{video}: expected a video for the report, found no such file")
+        source = _embedded(Path(video).read_bytes(), "video/mp4")
+        parts.append(f'<h2>Video</h2><video controls loop muted src="{source}"></video>')
+    curves = _curves(log)
+    if curves:
+        parts.append(f'<h2>Optimisation</h2><div class="curves">{"".join(curves)}</div>')
+    if timings:
+        parts += ["<h2>Time</h2>", _table(_timing_rows(timings))]
+    if skipped:
+        parts.append(f"<h2>Skipped</h2><ul>{''.join(f'<li>{escape(line)}</li>' for line in skipped)}</ul>")
+    body = "\n".join(parts)
+    document = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_STYLE}</style></head>\n<body>{body}</body></html>\n"
+    )
+    with atomic_write(path) as file:
+        file.write(document.encode())
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """The first row as heading, left out when it is empty."""
+    heading = "".join(f"<th>{escape(cell)}</th>" for cell in rows[0])
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows[1:])
+    return f"<table>{f'<tr>{heading}</tr>' if any(rows[0]) else ''}{body}</table>"
+
+
+def _timing_rows(timings: Mapping[str, float]) -> list[tuple[str, str, str]]:
+    total = sum(timings.values())
+    rows = [
+        (name, f"{seconds:.1f}", f"{100.0 * seconds / max(total, 1e-9):.0f} %")
+        for name, seconds in timings.items()
+    ]
+    return [("part", "seconds", "share"), *rows, ("all", f"{total:.1f}", "")]
+
+
+def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One plot for every number that is logged twice or more, over the steps of all stages in a row."""
+    positions: list[float] = []
+    borders: list[tuple[float, str]] = []
+    before, last, stage = 0.0, 0.0, None
+    for index, row in enumerate(log):
+        if row.get("stage") != stage:
+            before, last, stage = before + last, 0.0, row.get("stage")
+            borders.append((before, str(stage)))
+        last = float(row.get("step", index + 1))
+        positions.append(before + last)
+    numbers = [_numbers(row) for row in log]
+    names = dict.fromkeys(name for row in numbers for name in row)
+    plots = []
+    for name in names:
+        known = [(x, row[name]) for x, row in zip(positions, numbers, strict=True) if name in row]
+        if len(known) > 1:
+            plots.append(line_plot(name, *zip(*known, strict=True), borders=borders[1:]))
+    return [plot for plot in plots if plot]
+
+
+def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for key, value in row.items():
+        if isinstance(value, Mapping):
+            found |= {name: number for name, number in _numbers(value).items() if name not in found}
+        elif isinstance(value, Real) and not isinstance(value, bool) and key not in _POSITION_KEYS:
+            found[str(key)] = float(value) if math.isfinite(value) else math.nan
+    return found
+
+
+def _jpeg(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def _embedded(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
