@@ -208,7 +208,7 @@ def _load_records(stream: io.BytesIO, allow: frozenset[Global], *, persistent: b
     # A few forged bytes can make the unpickler allocate gigabytes: a length beyond the end of the data (which
     # this walk over the program notices by itself), or a memo slot that no program of this size would reach.
     for count, (opcode, argument, _position) in enumerate(pickletools.genops(stream)):
-        if opcode.name.endswith("PUT") and argument > count:
+        if opcode.name.endswith("PUT") and int(argument or 0) > count:
             raise ValueError(f"memo slot {argument} after {count} instructions")
     stream.seek(start)
     return _RecordingUnpickler(stream, allow, persistent=persistent).load()

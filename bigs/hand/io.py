@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from bigs.checks import InputError, check_choice, check_finite, check_shape
 from bigs.hand.model import MANO_PARENTS, HandModel
 from bigs.hand.procedural import procedural_hand
 from bigs.types import SIDES, Side
+from bigs.unpickle import CHUMPY, restricted_load
 
 FILE_STEMS: dict[Side, str] = {"right": "MANO_RIGHT", "left": "MANO_LEFT"}
 REQUIRED = (
@@ -29,6 +31,9 @@ REQUIRED = (
 # Fingertip vertices (thumb, index, middle, ring, pinky) of MANO's own mesh, which carries no list of them.
 MANO_VERTICES = 778
 MANO_TIPS = (744, 320, 443, 554, 671)
+
+# A hand in metres is this large; one in millimetres or another thing altogether is not.
+HAND_EXTENT = (0.05, 0.6)
 
 # Largest deviation from 1 of a row that should sum to 1.
 SUM_TOLERANCE = 1e-3
@@ -87,8 +92,20 @@ def find_model_file(folder: Path, side: Side) -> Path | None:
 
 
 def read_model_file(file: Path) -> dict[str, Any]:
-    """The raw fields of a model file, unchecked."""
-    return _read_npz(file)
+    """The raw fields of an .npz file or of a .pkl file in MANO's original layout, unchecked.
+
+    Raises:
+        InputError: the file cannot be read, or is a pickle of anything but data.
+    """
+    if file.suffix == ".npz":
+        return _read_npz(file)
+    if file.suffix != ".pkl":
+        raise InputError(f"{file}: expected a hand model with suffix .npz or .pkl, found '{file.suffix}'")
+    with file.open("rb") as stream:
+        fields = restricted_load(stream, name=str(file), allow=CHUMPY)
+    if not isinstance(fields, dict):
+        raise InputError(f"{file}: expected a pickled dict of fields, found {type(fields).__name__}")
+    return fields
 
 
 def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> HandModel:
@@ -104,12 +121,11 @@ def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> 
     """
     missing = [key for key in REQUIRED if key not in fields]
     if missing:
-        raise InputError(
-            f"{name}: expected a hand model with field '{missing[0]}', found only {_listed(fields)}"
-        )
+        raise InputError(f"{name}: expected a hand model with field '{missing[0]}', found {_listed(fields)}")
     joints = len(MANO_PARENTS)
     v_template = _floats(fields, "v_template", ("V", 3), name)
     vertices = len(v_template)
+    _check_extent(v_template, name)
     weights = _floats(fields, "weights", (vertices, joints), name)
     regressor = _floats(fields, "J_regressor", (joints, vertices), name)
     shapedirs = _floats(fields, "shapedirs", (vertices, 3, 10), name)
@@ -140,14 +156,14 @@ def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> 
 
 def _read_npz(file: Path) -> dict[str, Any]:
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream:
+            archive = np.load(stream, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds a single array")
+                raise ValueError("a single array")
             return {key: archive[key] for key in archive.files}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"{file}: expected an .npz archive of plain arrays, found one that cannot be read ({error})"
-        ) from error
+        reason = str(error) or "nothing"
+        raise InputError(f"{file}: expected an .npz archive of plain arrays, found: {reason}") from error
 
 
 def _listed(fields: dict[str, Any]) -> str:
@@ -156,7 +172,13 @@ def _listed(fields: dict[str, Any]) -> str:
 
 
 def _floats(fields: dict[str, Any], key: str, shape: tuple[int | str, ...] | None, name: str) -> np.ndarray:
-    array = np.asarray(fields[key])
+    value = fields[key]
+    if scipy.sparse.issparse(value):
+        # A forged shape must not be made dense before it is known to be the right one.
+        if shape is not None:
+            check_shape(f"{name}, {key}", value, shape)
+        value = value.toarray()
+    array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name}, {key}: expected an array of numbers, found dtype {array.dtype}")
     if shape is not None:
@@ -170,6 +192,12 @@ def _integers(fields: dict[str, Any], key: str, shape: tuple[int | str, ...], na
     if (array != np.round(array)).any():
         raise InputError(f"{name}, {key}: expected whole numbers, found {array[array != np.round(array)][0]}")
     return array.astype(np.int64)
+
+
+def _check_extent(v_template: np.ndarray, name: str) -> None:
+    extent = float(np.ptp(v_template, axis=0).max()) if len(v_template) else 0.0
+    if not HAND_EXTENT[0] < extent < HAND_EXTENT[1]:
+        raise InputError(f"{name}, v_template: expected a hand in metres, found {extent:.4g} across")
 
 
 def _check_indices(name: str, indices: np.ndarray, vertices: int) -> None:

@@ -1,11 +1,12 @@
 """A hand made by code, so that everything runs without any model file.
 
-Same joint tree, axes and number of shape directions as a MANO-format file; no pose correctives, flat mean pose.
+Joint tree, axes and number of shapes as in a MANO-format file; no pose correctives, flat mean pose.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def procedural_hand(side: Side = "right") -> HandModel:
 
 
 @lru_cache(maxsize=1)
-def _right_hand_arrays() -> dict[str, np.ndarray]:
+def _right_hand_arrays() -> dict[str, Any]:
     margin = 0.006
     joints = rest_joints()
     tips = np.array([chain_points(finger)[3] for finger in FINGERS.values()])
@@ -102,7 +103,7 @@ def _skinning_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         # How far past each joint a vertex lies, measured along the mean of the two bones that meet there; the
         # palm bends with the first bone over a longer stretch at the thumb's saddle joint.
         before = [bones[0], bones[0] + bones[1], bones[1] + bones[2]]
-        past = []
+        past: list[np.ndarray] = []
         for joint, along, radius in zip(points, before, finger.radii, strict=False):
             reach = 0.75 * radius if name != "thumb" or len(past) else 1.2 * radius
             past.append(_smooth_step((vertices - joint) @ (along / np.linalg.norm(along)), -reach, reach))
@@ -142,8 +143,8 @@ def _finger_membership(vertices: np.ndarray) -> dict[str, np.ndarray]:
 def _joint_regressor(vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Rows [16, V] that are non-negative, sum to 1, and give the rest joints exactly.
 
-    Each row is a bell around the joint times exp(tilt . v), the tilt found by Newton's method: of all weightings
-    whose mean is the joint, the one nearest to the bell in relative entropy.
+    Each row is a bell around the joint times exp(tilt . v), the tilt found by Newton's method: of all
+    weightings whose mean is the joint, the one nearest to the bell in relative entropy.
     """
     rows = []
     for joint, parent in enumerate(MANO_PARENTS):

@@ -1,8 +1,8 @@
 """Isotropic remeshing of an implicit surface: a fine marching-cubes mesh to few, well-shaped triangles.
 
 Rounds of collapsing short edges, flipping edges towards Delaunay, and relaxing vertices on the surface. Every
-step picks edges that are far enough apart to be changed at once, so all of it is array work; the result depends
-on nothing but the input. A collapse keeps a closed manifold closed and manifold (the link condition is checked).
+step picks edges that are far enough apart to be changed at once, so it is all array work; the result depends
+on nothing but the input. A closed manifold stays closed and manifold: the link condition is checked.
 """
 
 from __future__ import annotations
