@@ -145,6 +145,9 @@ def _batch_of(
     n = tensors["means"].shape[-2] if tensors["means"].ndim >= 2 else "N"
     cameras = tensors["viewmats"].shape[-3] if tensors["viewmats"].ndim >= 3 else "C"
     channels = tensors["colors"].shape[-1] if tensors["colors"].ndim >= 2 else "D"
+    if channels == 0 or cameras == 0:
+        name, what = ("colors", "channel") if channels == 0 else ("viewmats", "camera")
+        raise InputError(f"{name}: expected at least one {what}, found shape {list(tensors[name].shape)}")
     trailing: dict[str, tuple[int | str, ...]] = {
         "means": (n, 3),
         "quats": (n, 4),
@@ -168,9 +171,6 @@ def _batch_of(
             shown = ", ".join(map(str, ("...", *expected)))
             raise InputError(f"{name}: expected shape [{shown}], found {list(tensor.shape)}")
         leading[name] = tuple(tensor.shape[: tensor.ndim - len(expected)])
-    if channels == 0 or cameras == 0:
-        name = "colors" if channels == 0 else "viewmats"
-        raise InputError(f"{name}: expected at least one, found shape {list(tensors[name].shape)}")
 
     depth = max(len(axes) for name, axes in leading.items() if name != "colors")
     colors_per_camera = len(leading["colors"]) == depth + 1

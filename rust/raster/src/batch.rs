@@ -30,8 +30,7 @@ impl<'a, U> Slabs<'a, U> {
     /// Which slab a view uses.
     fn index(&self, view: usize, cameras: usize) -> usize {
         let (entry, camera) = (view / cameras, view % cameras);
-        (if self.entries > 1 { entry } else { 0 }) * self.cameras
-            + if self.cameras > 1 { camera } else { 0 }
+        (if self.entries > 1 { entry } else { 0 }) * self.cameras + if self.cameras > 1 { camera } else { 0 }
     }
 
     fn slab(&self, view: usize, cameras: usize) -> &'a [U] {
@@ -39,12 +38,7 @@ impl<'a, U> Slabs<'a, U> {
         &self.data[self.index(view, cameras) * size..][..size]
     }
 
-    fn check(
-        &self,
-        name: &'static str,
-        shape: &BatchShape,
-        elements: usize,
-    ) -> Result<(), RasterError> {
+    fn check(&self, name: &'static str, shape: &BatchShape, elements: usize) -> Result<(), RasterError> {
         let fits = |have: usize, want: usize| have == 1 || have == want;
         if !fits(self.entries, shape.entries) {
             return check_length(name, shape.entries, self.entries);
@@ -157,13 +151,11 @@ pub struct Counters {
 impl<T> BatchState<T> {
     /// Sums over the views.
     pub fn counters(&self) -> Counters {
-        self.views
-            .iter()
-            .fold(Counters::default(), |sum, view| Counters {
-                intersections: sum.intersections + view.intersections(),
-                visible: sum.visible + view.visible(),
-                empty_tiles: sum.empty_tiles + view.empty_tiles(),
-            })
+        self.views.iter().fold(Counters::default(), |sum, view| Counters {
+            intersections: sum.intersections + view.intersections(),
+            visible: sum.visible + view.visible(),
+            empty_tiles: sum.empty_tiles + view.empty_tiles(),
+        })
     }
 }
 
@@ -310,14 +302,8 @@ impl<'a, T: Real> Batch<'a, T> {
                 channels: self.shape.channels,
             },
             camera: self.cameras[view],
-            background: self
-                .inputs
-                .backgrounds
-                .map(|slabs| slabs.slab(view, cameras)),
-            pixel_mask: self
-                .inputs
-                .pixel_mask
-                .map(|slabs| slabs.slab(view, cameras)),
+            background: self.inputs.backgrounds.map(|slabs| slabs.slab(view, cameras)),
+            pixel_mask: self.inputs.pixel_mask.map(|slabs| slabs.slab(view, cameras)),
         }
     }
 
@@ -326,11 +312,7 @@ impl<'a, T: Real> Batch<'a, T> {
     /// # Errors
     /// [`RasterError::TooManyIntersections`].
     pub fn render(&self) -> Result<(BatchImages<T>, BatchState<T>), RasterError> {
-        let (views, n, pixels) = (
-            self.shape.views(),
-            self.shape.gaussians,
-            self.shape.pixels(),
-        );
+        let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
         let total = self.shape.image_channels(self.mode);
         let mut images = BatchImages {
             colors: vec![T::ZERO; views * pixels * total],
@@ -375,18 +357,13 @@ impl<'a, T: Real> Batch<'a, T> {
         v_alphas: &[T],
         wanted: Wanted,
     ) -> Result<BatchGradients<T>, RasterError> {
-        let (views, n, pixels) = (
-            self.shape.views(),
-            self.shape.gaussians,
-            self.shape.pixels(),
-        );
+        let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
         let total = self.shape.image_channels(self.mode);
         check_length("v_colors", views * pixels * total, v_colors.len())?;
         check_length("v_alphas", views * pixels, v_alphas.len())?;
 
         // One slab per view, summed where views share an input.
-        let buffer =
-            |wanted: bool, size: usize| vec![T::ZERO; if wanted { views * size } else { 0 }];
+        let buffer = |wanted: bool, size: usize| vec![T::ZERO; if wanted { views * size } else { 0 }];
         let mut means = buffer(wanted.means, 3 * n);
         let mut quats = buffer(wanted.quats, 4 * n);
         let mut scales = buffer(wanted.scales, 3 * n);
@@ -461,15 +438,13 @@ impl<'a, T: Real> Batch<'a, T> {
                 .filter(|&(view, _)| slabs.index(view, self.shape.cameras) == index)
                 .map(|(_, values)| values)
                 .collect();
-            slab.par_chunks_mut(PART)
-                .enumerate()
-                .for_each(|(part, sums)| {
-                    for values in &sharing {
-                        for (sum, &v) in sums.iter_mut().zip(&values[part * PART..]) {
-                            *sum += v;
-                        }
+            slab.par_chunks_mut(PART).enumerate().for_each(|(part, sums)| {
+                for values in &sharing {
+                    for (sum, &v) in sums.iter_mut().zip(&values[part * PART..]) {
+                        *sum += v;
                     }
-                });
+                }
+            });
         }
         sums
     }

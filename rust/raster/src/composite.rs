@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::dispatch::{self, SimdLevel};
 use crate::kernel::{
-    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_PIXELS, MOMENTS, TileCotangents,
-    TileImage, TilePlane, TileTask,
+    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_PIXELS, MOMENTS, TileCotangents, TileImage,
+    TilePlane, TileTask,
 };
 use crate::project::Splat;
 use crate::real::Real;
@@ -17,15 +17,15 @@ use crate::tiles::{TileBins, TileGrid};
 /// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
 const LEAST_ALPHA: f64 = 1e-10;
 
-/// The composited tiles, kept for the backward pass. Tile-major; pixels of a tile in block order.
+/// What the backward pass needs of the composited tiles. Tile-major; pixels of a tile in block order.
 #[derive(Debug)]
 pub(crate) struct Canvas<T> {
-    /// Channel planes of each tile.
-    colors: Vec<T>,
     transmittance: Vec<T>,
     last: Vec<u32>,
     /// Blocks reached, per entry of `TileBins::ranks`.
     masks: Vec<u16>,
+    /// Accumulated depth where the image has expected depth, else empty.
+    depths: Vec<T>,
 }
 
 /// What all tiles of a view share.
@@ -47,8 +47,7 @@ impl<'a, T: Real> Scene<'a, T> {
         TileTask {
             origin: self.grid.origin(tile),
             side: self.grid.tile_size / BLOCK,
-            ranks: &self.bins.ranks
-                [self.bins.offsets[tile] as usize..self.bins.offsets[tile + 1] as usize],
+            ranks: &self.bins.ranks[self.bins.offsets[tile] as usize..self.bins.offsets[tile + 1] as usize],
             splats: self.splats,
             ids: self.ids,
             channels: self.channels,
@@ -84,105 +83,154 @@ impl<'a, T: Real> Scene<'a, T> {
     }
 }
 
-/// Cuts a buffer into one piece per tile, `stride` values per entry of the tile's list.
-fn pieces_per_tile<'a, U>(
+/// Cuts a buffer into one piece per group of `tiles` tiles, `stride` values per entry of the tiles' lists.
+fn pieces_by_tile<'a, U>(
     mut buffer: &'a mut [U],
     offsets: &[u32],
+    tiles: usize,
     stride: usize,
 ) -> Vec<&'a mut [U]> {
-    offsets
-        .windows(2)
-        .map(|pair| {
-            let (piece, rest) =
-                std::mem::take(&mut buffer).split_at_mut((pair[1] - pair[0]) as usize * stride);
+    let ends = offsets.iter().skip(tiles).step_by(tiles);
+    let starts = offsets.iter().step_by(tiles);
+    starts
+        .zip(ends)
+        .map(|(start, end)| {
+            let size = (end - start) as usize * stride;
+            let (piece, rest) = std::mem::take(&mut buffer).split_at_mut(size);
             buffer = rest;
             piece
         })
         .collect()
 }
 
-/// Composites every tile.
-pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>) -> Canvas<T> {
-    let level = SimdLevel::detect();
-    let pixels = scene.grid.pixels_per_tile();
-    let tiles = scene.grid.len();
+/// One row of tiles: its part of the image, which is contiguous, and of the canvas.
+struct TileRow<'a, T> {
+    colors: &'a mut [T],
+    alphas: &'a mut [T],
+    transmittance: &'a mut [T],
+    last: &'a mut [u32],
+    depths: &'a mut [T],
+    masks: &'a mut [u16],
+}
+
+/// Composites every tile over the background into the image.
+pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>, colors: &mut [T], alphas: &mut [T]) -> Canvas<T> {
+    let grid = &scene.grid;
+    let pixels = grid.pixels_per_tile();
     let total = scene.channels.total;
     let mut canvas = Canvas {
-        colors: vec![T::ZERO; tiles * pixels * total],
-        transmittance: vec![T::ONE; tiles * pixels],
-        last: vec![0; tiles * pixels],
+        transmittance: vec![T::ONE; grid.len() * pixels],
+        last: vec![0; grid.len() * pixels],
         masks: vec![0; scene.bins.ranks.len()],
+        depths: vec![
+            T::ZERO;
+            if scene.expected_depth {
+                grid.len() * pixels
+            } else {
+                0
+            }
+        ],
     };
-    let masks = pieces_per_tile(&mut canvas.masks, &scene.bins.offsets, 1);
-    (
-        masks,
-        canvas.colors.par_chunks_mut(pixels * total),
-        canvas.transmittance.par_chunks_mut(pixels),
-        canvas.last.par_chunks_mut(pixels),
-    )
-        .into_par_iter()
+    let image_row = grid.tile_size * grid.width;
+    let canvas_row = grid.columns * pixels;
+    let mut depths = canvas.depths.chunks_mut(canvas_row);
+    let rows: Vec<TileRow<'_, T>> = pieces_by_tile(&mut canvas.masks, &scene.bins.offsets, grid.columns, 1)
+        .into_iter()
+        .zip(colors.chunks_mut(image_row * total))
+        .zip(alphas.chunks_mut(image_row))
+        .zip(canvas.transmittance.chunks_mut(canvas_row))
+        .zip(canvas.last.chunks_mut(canvas_row))
+        .map(|((((masks, colors), alphas), transmittance), last)| TileRow {
+            colors,
+            alphas,
+            transmittance,
+            last,
+            depths: depths.next().unwrap_or_default(),
+            masks,
+        })
+        .collect();
+    rows.into_par_iter()
         .enumerate()
-        .for_each(|(tile, (masks, colors, transmittance, last))| {
-            if masks.is_empty() {
-                return;
-            }
-            let mut open = [false; MAX_PIXELS];
-            scene.for_pixels(tile, |p, _| open[p] = true);
-            let mut task = scene.task(tile);
-            while task.first < total {
-                let out = TileImage {
-                    colors: &mut colors[task.first * pixels..],
-                    transmittance,
-                    last,
-                    masks,
-                };
-                dispatch::forward(level, &task, &open, out);
-                task.first += MAX_CHANNELS;
-            }
-        });
+        .for_each(|(row, out)| composite_row(scene, row, out));
     canvas
 }
 
-/// Writes the canvas as an image: adds the background, divides expected depth by alpha.
-pub(crate) fn write_image<T: Real>(
+fn composite_row<T: Real>(scene: &Scene<'_, T>, row: usize, out: TileRow<'_, T>) {
+    let level = SimdLevel::detect();
+    let grid = &scene.grid;
+    let pixels = grid.pixels_per_tile();
+    let total = scene.channels.total;
+    let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
+    let mut planes = vec![T::ZERO; total * pixels];
+    let first_entry = scene.bins.offsets[row * grid.columns] as usize;
+    for column in 0..grid.columns {
+        let tile = row * grid.columns + column;
+        let mut task = scene.task(tile);
+        let own = column * pixels..(column + 1) * pixels;
+        let transmittance = &mut out.transmittance[own.clone()];
+        if task.ranks.is_empty() {
+            planes.fill(T::ZERO);
+        } else {
+            let mut open = [false; MAX_PIXELS];
+            scene.for_pixels(tile, |p, _| open[p] = true);
+            let entries = scene.bins.offsets[tile] as usize - first_entry;
+            while task.first < total {
+                let tile_image = TileImage {
+                    colors: &mut planes[task.first * pixels..],
+                    transmittance: &mut *transmittance,
+                    last: &mut out.last[own.clone()],
+                    masks: &mut out.masks[entries..][..task.ranks.len()],
+                };
+                dispatch::forward(level, &task, &open, tile_image);
+                task.first += MAX_CHANNELS;
+            }
+        }
+        if scene.expected_depth {
+            out.depths[own].copy_from_slice(&planes[(total - 1) * pixels..]);
+        }
+        write_tile(
+            scene,
+            &background,
+            column,
+            &planes,
+            transmittance,
+            out.colors,
+            out.alphas,
+        );
+    }
+}
+
+/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.
+fn write_tile<T: Real>(
     scene: &Scene<'_, T>,
-    canvas: &Canvas<T>,
+    background: &[T],
+    column: usize,
+    planes: &[T],
+    transmittance: &[T],
     colors: &mut [T],
     alphas: &mut [T],
 ) {
     let grid = &scene.grid;
     let total = scene.channels.total;
     let (pixels, side) = (grid.pixels_per_tile(), grid.tile_size / BLOCK);
-    let background: Vec<T> = (0..total)
-        .map(|channel| scene.background(channel))
-        .collect();
-    (
-        colors.par_chunks_mut(grid.width * total),
-        alphas.par_chunks_mut(grid.width),
-    )
-        .into_par_iter()
-        .enumerate()
-        .for_each(|(y, (colors, alphas))| {
-            for x in (0..grid.width).step_by(BLOCK) {
-                let tile = y / grid.tile_size * grid.columns + x / grid.tile_size;
-                let block = y % grid.tile_size / BLOCK * side + x % grid.tile_size / BLOCK;
-                let p = block * LANES + y % BLOCK * BLOCK;
-                let planes = &canvas.colors[tile * pixels * total..][..pixels * total];
-                for i in 0..BLOCK.min(grid.width - x) {
-                    let transmittance = canvas.transmittance[tile * pixels + p + i];
-                    let pixel = &mut colors[(x + i) * total..][..total];
-                    for (channel, value) in pixel.iter_mut().enumerate() {
-                        *value =
-                            planes[channel * pixels + p + i] + transmittance * background[channel];
-                    }
-                    let alpha = T::ONE - transmittance;
-                    alphas[x + i] = alpha;
-                    if scene.expected_depth {
-                        pixel[total - 1] = pixel[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
-                    }
+    let left = column * grid.tile_size;
+    for y in 0..alphas.len() / grid.width {
+        for x in (0..grid.tile_size.min(grid.width - left)).step_by(BLOCK) {
+            let p = (y / BLOCK * side + x / BLOCK) * LANES + y % BLOCK * BLOCK;
+            for i in 0..BLOCK.min(grid.width - left - x) {
+                let pixel = y * grid.width + left + x + i;
+                let values = &mut colors[pixel * total..][..total];
+                for (channel, value) in values.iter_mut().enumerate() {
+                    *value = planes[channel * pixels + p + i] + transmittance[p + i] * background[channel];
+                }
+                let alpha = T::ONE - transmittance[p + i];
+                alphas[pixel] = alpha;
+                if scene.expected_depth {
+                    values[total - 1] = values[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
                 }
             }
-        });
+        }
+    }
 }
 
 /// Gradients of an image.
@@ -202,7 +250,7 @@ pub(crate) struct CompositeGradients<T> {
     pub(crate) tiles_skipped: usize,
 }
 
-/// The vjp of [`composite`] and [`write_image`].
+/// The vjp of [`composite`].
 pub(crate) fn composite_vjp<T: Real>(
     scene: &Scene<'_, T>,
     canvas: &Canvas<T>,
@@ -216,7 +264,7 @@ pub(crate) fn composite_vjp<T: Real>(
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     (
-        pieces_per_tile(&mut slots, &scene.bins.offsets, stride),
+        pieces_by_tile(&mut slots, &scene.bins.offsets, 1, stride),
         backgrounds.par_chunks_mut(total),
     )
         .into_par_iter()
@@ -230,8 +278,7 @@ pub(crate) fn composite_vjp<T: Real>(
             let transmittance = &canvas.transmittance[own.clone()];
             let mut skipped = true;
             while task.first < total {
-                let (v_values, v_transmittance, any) =
-                    load_cotangents(scene, canvas, tile, task.first, v);
+                let (v_values, v_transmittance, any) = load_cotangents(scene, canvas, tile, task.first, v);
                 for k in 0..(total - task.first).min(MAX_CHANNELS) {
                     v_background[task.first + k] = transmittance
                         .iter()
@@ -244,8 +291,8 @@ pub(crate) fn composite_vjp<T: Real>(
                     let cotangents = TileCotangents {
                         transmittance,
                         last: &canvas.last[own.clone()],
-                        masks: &canvas.masks[scene.bins.offsets[tile] as usize
-                            ..scene.bins.offsets[tile + 1] as usize],
+                        masks: &canvas.masks
+                            [scene.bins.offsets[tile] as usize..scene.bins.offsets[tile + 1] as usize],
                         v_values: &v_values,
                         v_transmittance: &v_transmittance,
                     };
@@ -285,7 +332,6 @@ fn load_cotangents<T: Real>(
     let zero = [Lanes::splat(T::ZERO); MAX_BLOCKS];
     let (mut v_values, mut v_transmittance) = ([zero; MAX_CHANNELS], zero);
     let mut any = false;
-    let depth_plane = (tile * total + total - 1) * pixels;
     scene.for_pixels(tile, |p, pixel| {
         // Alpha is 1 − transmittance; it belongs to the first group of channels.
         let mut v_alpha = if first == 0 { v.alphas[pixel] } else { T::ZERO };
@@ -297,7 +343,7 @@ fn load_cotangents<T: Real>(
                 let least = T::of(LEAST_ALPHA);
                 value = value / alpha.greater(least);
                 if alpha > least {
-                    v_alpha += -(value * (canvas.colors[depth_plane + p] / alpha));
+                    v_alpha += -(value * (canvas.depths[tile * pixels + p] / alpha));
                 }
             }
             v_values[k][p / LANES][p % LANES] = value;

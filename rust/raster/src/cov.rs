@@ -88,8 +88,7 @@ pub(crate) fn rotation_vjp<T: Real>(unit: [T; 4], inverse_length: T, v: &Mat3<T>
         two * (x * (v[0][2] + v[2][0]) + y * (v[1][2] + v[2][1]) + w * (v[1][0] - v[0][1])
             - two * z * (v[0][0] + v[1][1])),
     ];
-    let radial =
-        unit[0] * v_unit[0] + unit[1] * v_unit[1] + unit[2] * v_unit[2] + unit[3] * v_unit[3];
+    let radial = unit[0] * v_unit[0] + unit[1] * v_unit[1] + unit[2] * v_unit[2] + unit[3] * v_unit[3];
     [0, 1, 2, 3].map(|i| inverse_length * (v_unit[i] - unit[i] * radial))
 }
 
@@ -252,9 +251,6 @@ mod tests {
         assert!(whiten([0.0f32; 3], [0.0; 3], 0.0).is_none());
         assert!(whiten([1e30f32, 0.0, 0.0], [0.0, 1e30, 0.0], 0.3).is_none());
         assert_eq!(normalize_quat([0.0f32; 4]), ([0.0; 4], 0.0));
-        assert_eq!(
-            normalize_quat([1e-30f32, 0.0, 0.0, 0.0]).0,
-            [1.0, 0.0, 0.0, 0.0]
-        );
+        assert_eq!(normalize_quat([1e-30f32, 0.0, 0.0, 0.0]).0, [1.0, 0.0, 0.0, 0.0]);
     }
 }

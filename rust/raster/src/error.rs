@@ -40,11 +40,7 @@ pub enum RasterError {
 impl fmt::Display for RasterError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::LengthMismatch {
-                name,
-                expected,
-                got,
-            } => {
+            Self::LengthMismatch { name, expected, got } => {
                 write!(f, "{name}: expected {expected} elements, found {got}")
             }
             Self::NotFinite { name, index } => {

@@ -63,19 +63,11 @@ impl<'a, T: Real> Gaussians<'a, T> {
     }
 }
 
-pub(crate) fn check_length(
-    name: &'static str,
-    expected: usize,
-    got: usize,
-) -> Result<(), RasterError> {
+pub(crate) fn check_length(name: &'static str, expected: usize, got: usize) -> Result<(), RasterError> {
     if expected == got {
         Ok(())
     } else {
-        Err(RasterError::LengthMismatch {
-            name,
-            expected,
-            got,
-        })
+        Err(RasterError::LengthMismatch { name, expected, got })
     }
 }
 

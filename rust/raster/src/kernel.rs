@@ -170,12 +170,8 @@ impl<T: Real> BlockCentres<T> {
     #[inline(always)]
     fn new(side: usize) -> Self {
         Self {
-            x: Lanes(std::array::from_fn(|b| {
-                T::of((b % side * BLOCK) as f64 + 0.5)
-            })),
-            y: Lanes(std::array::from_fn(|b| {
-                T::of((b / side * BLOCK) as f64 + 0.5)
-            })),
+            x: Lanes(std::array::from_fn(|b| T::of((b % side * BLOCK) as f64 + 0.5))),
+            y: Lanes(std::array::from_fn(|b| T::of((b / side * BLOCK) as f64 + 0.5))),
             mask: ((1u32 << (side * side)) - 1) as u16,
         }
     }
@@ -280,11 +276,7 @@ pub(crate) fn forward_tile<T: Real, A: Arithmetic, const K: usize>(
     let mut taking: u16 = 0;
     for block in 0..blocks {
         for i in 0..LANES {
-            lights[block].live[i] = if open[block * LANES + i] {
-                T::ONE
-            } else {
-                T::ZERO
-            };
+            lights[block].live[i] = if open[block * LANES + i] { T::ONE } else { T::ZERO };
         }
         taking |= u16::from(!lights[block].spent()) << block;
     }
@@ -335,8 +327,7 @@ pub(crate) fn forward_tile<T: Real, A: Arithmetic, const K: usize>(
                         light.transmittance[i] = select(on, next, light.transmittance[i]);
                         light.last[i] = select(on & hit, place, light.last[i]);
                         for k in 0..K {
-                            light.sums[k][i] =
-                                A::mul_add(weight, entry.values[k], light.sums[k][i]);
+                            light.sums[k][i] = A::mul_add(weight, entry.values[k], light.sums[k][i]);
                         }
                     }
                 }
@@ -435,8 +426,7 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
             let (corner_x, corner_y) = block_corner::<T>(block, task.side);
             let (x, y) = (entry.x - corner_x, entry.y - corner_y);
             let v_pixels: [&Lanes<T>; K] = std::array::from_fn(|k| &pixels.v_values[k][block]);
-            let (transmittance, behind, last) =
-                (&mut transmittance[block], &mut behind[block], &last[block]);
+            let (transmittance, behind, last) = (&mut transmittance[block], &mut behind[block], &last[block]);
             for i in 0..LANES {
                 let dx = lane_x[i] - x;
                 let dy = lane_y[i] - y;
@@ -478,10 +468,7 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
         for (sum, lanes) in slot.iter_mut().zip(&moments) {
             *sum += horizontal_sum(lanes);
         }
-        for (sum, lanes) in slot[MOMENTS + task.first..][..used]
-            .iter_mut()
-            .zip(&v_values)
-        {
+        for (sum, lanes) in slot[MOMENTS + task.first..][..used].iter_mut().zip(&v_values) {
             *sum += horizontal_sum(lanes);
         }
     }

@@ -57,8 +57,7 @@ mod sort;
 mod tiles;
 
 pub use batch::{
-    Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs,
-    Wanted,
+    Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs, Wanted,
 };
 pub use camera::{Camera, Intrinsics};
 pub use error::RasterError;

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 
 use crate::camera::Camera;
 use crate::cov::{
-    Mat3, Vec3, Whitening, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp,
-    whiten, whiten_vjp,
+    Mat3, Vec3, Whitening, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, whiten,
+    whiten_vjp,
 };
 use crate::gaussians::Gaussians;
 use crate::real::Real;
@@ -70,18 +70,13 @@ fn to_camera<T: Real>(camera: &Camera<T>, mean: Vec3<T>) -> Vec3<T> {
 }
 
 #[inline(always)]
-fn footprint<T: Real>(
-    camera: &Camera<T>,
-    point: Vec3<T>,
-    quat: [T; 4],
-    scale: Vec3<T>,
-) -> Footprint<T> {
+fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
     let (unit_quat, inverse_quat_length) = normalize_quat(quat);
     let axes = rotation_of(unit_quat);
     let scaled = axes.map(|row| [row[0] * scale[0], row[1] * scale[1], row[2] * scale[2]]);
-    let shape = camera.rotation.map(|row| {
-        [0, 1, 2].map(|j| row[0] * scaled[0][j] + row[1] * scaled[1][j] + row[2] * scaled[2][j])
-    });
+    let shape = camera
+        .rotation
+        .map(|row| [0, 1, 2].map(|j| row[0] * scaled[0][j] + row[1] * scaled[1][j] + row[2] * scaled[2][j]));
 
     let k = &camera.k;
     let inverse_z = T::ONE / point[2];
@@ -146,18 +141,13 @@ fn splat<T: Real>(
         T::of(f64::INFINITY)
     };
     let two_ln_2 = T::of(2.0 * std::f64::consts::LN_2);
-    let radius = w
-        .variances
-        .map(|variance| (two_ln_2 * reach * variance).sqrt());
+    let radius = w.variances.map(|variance| (two_ln_2 * reach * variance).sqrt());
     let (width, height) = (T::of(camera.width as f64), T::of(camera.height as f64));
-    let on_screen = x + radius[0] > T::ZERO
-        && x - radius[0] < width
-        && y + radius[1] > T::ZERO
-        && y - radius[1] < height;
+    let on_screen =
+        x + radius[0] > T::ZERO && x - radius[0] < width && y + radius[1] > T::ZERO && y - radius[1] < height;
     let clipped = radius[0] <= limits.radius_clip && radius[1] <= limits.radius_clip;
     // Radius 0 is a Gaussian that reaches the threshold only at its very centre.
-    if !on_screen || (clipped && limits.radius_clip > T::ZERO) || !(x.is_finite() && y.is_finite())
-    {
+    if !on_screen || (clipped && limits.radius_clip > T::ZERO) || !(x.is_finite() && y.is_finite()) {
         return None;
     }
     let splat = Splat {
@@ -256,11 +246,7 @@ pub(crate) fn project_vjp<T: Real>(
     i: usize,
     v: &SplatGradient<T>,
 ) -> Option<GaussianGradient<T>> {
-    let (mean, scale, opacity) = (
-        gaussians.means[i],
-        gaussians.scales[i],
-        gaussians.opacities[i],
-    );
+    let (mean, scale, opacity) = (gaussians.means[i], gaussians.scales[i], gaussians.opacities[i]);
     let shape = footprint(camera, to_camera(camera, mean), gaussians.quats[i], scale);
     let w: Whitening<T> = whiten(shape.rows[0], shape.rows[1], limits.eps2d)?;
     let (compensation, v_compensation) = if limits.antialiased {
@@ -311,18 +297,9 @@ pub(crate) fn project_vjp<T: Real>(
     let v_point = [v_sx * inverse_z, v_sy * inverse_z, v_z];
 
     // shape = R · axes · diag(scale)
-    let columns = [0, 1, 2].map(|j| {
-        apply_transposed(
-            &camera.rotation,
-            [v_shape[0][j], v_shape[1][j], v_shape[2][j]],
-        )
-    });
-    let v_scale = [0, 1, 2].map(|j| {
-        dot(
-            columns[j],
-            [shape.axes[0][j], shape.axes[1][j], shape.axes[2][j]],
-        )
-    });
+    let columns =
+        [0, 1, 2].map(|j| apply_transposed(&camera.rotation, [v_shape[0][j], v_shape[1][j], v_shape[2][j]]));
+    let v_scale = [0, 1, 2].map(|j| dot(columns[j], [shape.axes[0][j], shape.axes[1][j], shape.axes[2][j]]));
     let v_axes = [0, 1, 2].map(|i| [0, 1, 2].map(|j| columns[j][i] * scale[j]));
     let v_rotation = [0, 1, 2].map(|r| {
         [0, 1, 2].map(|c| {
@@ -337,13 +314,6 @@ pub(crate) fn project_vjp<T: Real>(
         quat: rotation_vjp(shape.unit_quat, shape.inverse_quat_length, &v_axes),
         scale: v_scale,
         opacity: v.h * compensation,
-        viewmat: [0, 1, 2].map(|r| {
-            [
-                v_rotation[r][0],
-                v_rotation[r][1],
-                v_rotation[r][2],
-                v_point[r],
-            ]
-        }),
+        viewmat: [0, 1, 2].map(|r| [v_rotation[r][0], v_rotation[r][1], v_rotation[r][2], v_point[r]]),
     })
 }

@@ -209,8 +209,7 @@ macro_rules! real {
                     k -= 1;
                     power = A::mul_add(power, fraction, $coefficients[k]);
                 }
-                let scaled =
-                    <$T>::from_bits(power.to_bits().wrapping_add(shifted.to_bits() << $mantissa));
+                let scaled = <$T>::from_bits(power.to_bits().wrapping_add(shifted.to_bits() << $mantissa));
                 select_unpredictable(self < $lowest, 0.0, scaled)
             }
         }
@@ -237,10 +236,7 @@ mod tests {
             let x32 = x as f32;
             let single: f32 = x32.exp2_of_nonpositive::<Separate>();
             let exact = f64::from(x32).exp2();
-            assert!(
-                (f64::from(single) - exact).abs() <= 3e-7 * exact,
-                "{x}: {single}"
-            );
+            assert!((f64::from(single) - exact).abs() <= 3e-7 * exact, "{x}: {single}");
         }
         assert_eq!(0f32.exp2_of_nonpositive::<Fused>(), 1.0);
         assert_eq!((-1e9f32).exp2_of_nonpositive::<Fused>(), 0.0);
@@ -259,17 +255,7 @@ mod tests {
 
     #[test]
     fn keys_sort_as_numbers_do() {
-        let sorted = [
-            -1e30f32,
-            -1.0,
-            -1e-40,
-            0.0,
-            1e-40,
-            0.5,
-            1.0,
-            3.0e7,
-            f32::MAX,
-        ];
+        let sorted = [-1e30f32, -1.0, -1e-40, 0.0, 1e-40, 0.5, 1.0, 3.0e7, f32::MAX];
         assert!(sorted.windows(2).all(|pair| pair[0].key() < pair[1].key()));
     }
 }

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::camera::Camera;
-use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp, write_image};
+use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp};
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
 use crate::kernel::{Channels, MOMENTS};
@@ -70,11 +70,7 @@ pub(crate) struct ViewGradients<'a, T> {
 }
 
 fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
-    let colored = if mode.has_colors() {
-        gaussians.channels
-    } else {
-        0
-    };
+    let colored = if mode.has_colors() { gaussians.channels } else { 0 };
     Channels {
         colors: gaussians.colors,
         stride: gaussians.channels,
@@ -130,8 +126,7 @@ pub(crate) fn render_view<T: Real>(
     let wanted = view.pixel_mask.map(|mask| wanted_tiles(mask, &grid));
     let bins = bin_tiles(&splats, &grid, wanted.as_deref())?;
     let scene = scene(view, mode, limits, &splats, &ids, &bins);
-    let canvas = composite(&scene);
-    write_image(&scene, &canvas, image.colors, image.alphas);
+    let canvas = composite(&scene, image.colors, image.alphas);
     Ok(ViewState {
         ids,
         splats,
@@ -195,58 +190,54 @@ pub(crate) fn render_view_vjp<T: Real>(
     )
         .into_par_iter()
         .enumerate()
-        .map(
-            |(chunk, (means, quats, scales, opacities, colors, ranks))| {
-                let mut v_viewmat = [[T::ZERO; 4]; 3];
-                let mut slot = vec![T::ZERO; slot_size];
-                for (local, &rank) in ranks.iter().enumerate() {
-                    if rank == u32::MAX {
-                        continue;
-                    }
-                    slot.fill(T::ZERO);
-                    let own =
-                        state.bins.starts[rank as usize]..state.bins.starts[rank as usize + 1];
-                    for &position in &state.bins.positions[own.start as usize..own.end as usize] {
-                        let part = &gradients.slots[position as usize * slot_size..][..slot_size];
-                        for (sum, &v) in slot.iter_mut().zip(part) {
-                            *sum += v;
-                        }
-                    }
-                    if !colors.is_empty() {
-                        for (sum, &v) in colors[local * stride..][..colored]
-                            .iter_mut()
-                            .zip(&slot[MOMENTS..])
-                        {
-                            *sum += v;
-                        }
-                    }
-                    if !geometry {
-                        continue;
-                    }
-                    let v_splat = SplatGradient {
-                        h: slot[0],
-                        first: [slot[1], slot[2]],
-                        second: [slot[3], slot[4], slot[5]],
-                        depth: if total > colored {
-                            slot[MOMENTS + colored]
-                        } else {
-                            T::ZERO
-                        },
-                    };
-                    let i = chunk * CHUNK + local;
-                    let Some(v) = project_vjp(&view.gaussians, &view.camera, limits, i, &v_splat)
-                    else {
-                        continue;
-                    };
-                    add(means.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.mean);
-                    add(quats.get_mut(local).map(<[T; 4]>::as_mut_slice), &v.quat);
-                    add(scales.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.scale);
-                    add(opacities.get_mut(local..=local), &[v.opacity]);
-                    add(Some(v_viewmat.as_flattened_mut()), v.viewmat.as_flattened());
+        .map(|(chunk, (means, quats, scales, opacities, colors, ranks))| {
+            let mut v_viewmat = [[T::ZERO; 4]; 3];
+            let mut slot = vec![T::ZERO; slot_size];
+            for (local, &rank) in ranks.iter().enumerate() {
+                if rank == u32::MAX {
+                    continue;
                 }
-                v_viewmat
-            },
-        )
+                slot.fill(T::ZERO);
+                let own = state.bins.starts[rank as usize]..state.bins.starts[rank as usize + 1];
+                for &position in &state.bins.positions[own.start as usize..own.end as usize] {
+                    let part = &gradients.slots[position as usize * slot_size..][..slot_size];
+                    for (sum, &v) in slot.iter_mut().zip(part) {
+                        *sum += v;
+                    }
+                }
+                if !colors.is_empty() {
+                    for (sum, &v) in colors[local * stride..][..colored]
+                        .iter_mut()
+                        .zip(&slot[MOMENTS..])
+                    {
+                        *sum += v;
+                    }
+                }
+                if !geometry {
+                    continue;
+                }
+                let v_splat = SplatGradient {
+                    h: slot[0],
+                    first: [slot[1], slot[2]],
+                    second: [slot[3], slot[4], slot[5]],
+                    depth: if total > colored {
+                        slot[MOMENTS + colored]
+                    } else {
+                        T::ZERO
+                    },
+                };
+                let i = chunk * CHUNK + local;
+                let Some(v) = project_vjp(&view.gaussians, &view.camera, limits, i, &v_splat) else {
+                    continue;
+                };
+                add(means.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.mean);
+                add(quats.get_mut(local).map(<[T; 4]>::as_mut_slice), &v.quat);
+                add(scales.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.scale);
+                add(opacities.get_mut(local..=local), &[v.opacity]);
+                add(Some(v_viewmat.as_flattened_mut()), v.viewmat.as_flattened());
+            }
+            v_viewmat
+        })
         .collect();
     if !out.viewmat.is_empty() {
         for v in &v_viewmats {
@@ -343,8 +334,7 @@ impl<T: Real> Renderer<T> {
         let total = channels_of(gaussians, self.mode).total;
         let mut colors = vec![T::ZERO; pixels * total];
         let mut alphas = vec![T::ZERO; pixels];
-        let (mut means2d, mut depths, mut radii) =
-            (vec![[T::ZERO; 2]; n], vec![T::ZERO; n], vec![[0; 2]; n]);
+        let (mut means2d, mut depths, mut radii) = (vec![[T::ZERO; 2]; n], vec![T::ZERO; n], vec![[0; 2]; n]);
         let image = Image {
             colors: &mut colors,
             alphas: &mut alphas,

@@ -49,11 +49,7 @@ impl RasterSettings {
     /// [`RasterError::BadSetting`] names the first that is not.
     pub fn validate(&self) -> Result<(), RasterError> {
         let checks = [
-            (
-                matches!(self.tile_size, 4 | 8 | 16),
-                "tile_size",
-                "4, 8 or 16",
-            ),
+            (matches!(self.tile_size, 4 | 8 | 16), "tile_size", "4, 8 or 16"),
             (
                 self.eps2d >= 0.0 && self.eps2d.is_finite(),
                 "eps2d",
@@ -69,11 +65,7 @@ impl RasterSettings {
                 "far_plane",
                 "a number above near_plane",
             ),
-            (
-                self.radius_clip >= 0.0,
-                "radius_clip",
-                "a number of at least 0",
-            ),
+            (self.radius_clip >= 0.0, "radius_clip", "a number of at least 0"),
             (
                 (0.0..1.0).contains(&self.alpha_threshold),
                 "alpha_threshold",

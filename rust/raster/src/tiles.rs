@@ -64,14 +64,8 @@ pub(crate) fn sort_by_depth<T: Real>(projected: &mut Projected<T>) {
         .map(|(splat, i)| (splat.depth.key(), i))
         .collect();
     radix_sort(&mut order);
-    projected.ids = order
-        .iter()
-        .map(|&(_, i)| projected.ids[i as usize])
-        .collect();
-    projected.splats = order
-        .iter()
-        .map(|&(_, i)| projected.splats[i as usize])
-        .collect();
+    projected.ids = order.iter().map(|&(_, i)| projected.ids[i as usize]).collect();
+    projected.splats = order.iter().map(|&(_, i)| projected.splats[i as usize]).collect();
 }
 
 /// A little more than `reach`: culling must never drop a pair that the compositor, rounding differently, would keep.

@@ -1,0 +1,52 @@
+"""The same bits for any number of threads and every run."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from raster_scenes import gradients, scene
+
+SCRIPT = """
+import hashlib, sys
+sys.path.insert(0, sys.argv[1])
+import torch
+from raster_scenes import gradients, scene
+inputs = scene(n=3000, channels=4, batch=(5,), cameras=2, width=120, height=90, dtype=torch.float32)
+for name in ("scales", "opacities", "colors", "backgrounds"):
+    inputs[name] = inputs[name][0]
+colors, alphas, grads = gradients(inputs, render_mode="RGB+D")
+digest = hashlib.sha256()
+for tensor in (colors, alphas, *grads.values()):
+    digest.update(tensor.numpy().tobytes())
+print(digest.hexdigest())
+"""
+
+
+def digest(threads: int) -> str:
+    environment = {**os.environ, "RAYON_NUM_THREADS": str(threads), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", SCRIPT, os.path.dirname(__file__)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+
+def test_thread_counts():
+    single = digest(1)
+    assert digest(2) == single
+    assert digest(3) == single
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_repeated_runs(dtype):
+    inputs = scene(n=500, batch=(3,), width=70, height=50, dtype=dtype)
+    first, second = gradients(inputs), gradients(inputs)
+    assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
+    assert all(torch.equal(first[2][name], second[2][name]) for name in first[2])
+
+
+def test_a_batch_is_its_entries():
+    inputs = scene(n=400, batch=(4,), width=50, height=40, dtype=torch.float32)
+    whole = gradients(inputs)[0]
+    for i in range(4):
+        entry = {k: v[i] if isinstance(v, torch.Tensor) else v for k, v in inputs.items()}
+        assert torch.equal(gradients(entry)[0], whole[i])
