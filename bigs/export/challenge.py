@@ -29,7 +29,7 @@ _SCENE_RADIUS = 2.0
 # Two float16 numbers of about a metre, subtracted, are this exact at best.
 _HALF_TOLERANCE = 2e-3
 # HOLD saves its dictionary as a class of its own; it is read as the dictionary it is.
-_HOLD_DICTIONARY = [(OrderedDict, "common.xdict.xdict")]
+_HOLD_DICTIONARY: list[Any] = [(OrderedDict, "common.xdict.xdict")]
 
 
 def write_challenge(
@@ -54,8 +54,6 @@ def write_challenge(
     Raises:
         InputError: something is missing, does not fit, or is not finite (also once in float16).
     """
-    if trajectory.joints.get("left") is not None and v_posed_left is None:
-        raise InputError(f"{path}: v_posed_left: expected vertices for a clip with a left hand, found none")
     shift = np.asarray(normalize_shift, dtype=np.float64)
     check_shape(f"{path}: normalize_shift", shift, (3,))
     check_finite(f"{path}: normalize_shift", shift)
@@ -68,6 +66,10 @@ def write_challenge(
         if f"v3d_c.{entity}" in points:
             points[f"verts.{entity}"] = scene_scale * (points[f"v3d_c.{entity}"] * _GL_FROM_CV + shift)
     if "v3d_c.left" in points:
+        if v_posed_left is None:
+            raise InputError(
+                f"{path}: v_posed_left: expected vertices for a clip with a left hand, found none"
+            )
         frames, n_verts, _ = points["v3d_c.left"].shape
         check_shape(f"{path}: v_posed_left", v_posed_left, (frames, n_verts, 3)[-v_posed_left.ndim :])
         points["v_posed.left"] = np.broadcast_to(v_posed_left, (frames, n_verts, 3))
@@ -105,12 +107,11 @@ def load_challenge(path: str | Path, frame_names: Sequence[str] | None = None) -
     if len(names) != len(content["fnames"]):
         raise InputError(f"{path}: expected {len(names)} frames, found {len(content['fnames'])}")
 
-    def points(key: str) -> np.ndarray | None:
-        return content[key].double().numpy() if key in content else None
-
     def per_side(group: str) -> dict[Side, np.ndarray]:
-        return {side: points(f"{group}.{side}") for side in SIDES if f"{group}.{side}" in content}
+        keys: dict[Side, str] = {side: f"{group}.{side}" for side in SIDES}
+        return {side: content[key].double().numpy() for side, key in keys.items() if key in content}
 
+    object_verts = content.get("v3d_c.object")
     faces = {node: stored.long().numpy() for node, stored in content["faces"].items()}
     return HandObjectTrajectory(
         name=content["full_seq_name"],
@@ -118,7 +119,7 @@ def load_challenge(path: str | Path, frame_names: Sequence[str] | None = None) -
         joints=per_side("j3d_c"),
         verts=per_side("v3d_c"),
         faces={side: faces[side] for side in SIDES if side in faces},
-        object_verts=points("v3d_c.object"),
+        object_verts=None if object_verts is None else object_verts.double().numpy(),
         object_faces=faces.get("object"),
     )
 
@@ -177,12 +178,11 @@ def _half(name: str, values: np.ndarray) -> torch.Tensor:
 def _faces(
     where: str, trajectory: HandObjectTrajectory, points: Mapping[str, np.ndarray]
 ) -> dict[str, torch.Tensor]:
-    meshes = {**trajectory.faces, "object": trajectory.object_faces}
     stored: dict[str, torch.Tensor] = {}
     for entity in ENTITIES:
         if f"v3d_c.{entity}" not in points:
             continue
-        faces = meshes.get(entity)
+        faces = trajectory.object_faces if entity == "object" else trajectory.faces.get(entity)
         if faces is None:
             raise InputError(f"{where}: faces.{entity}: expected the faces of a mesh, found none")
         n_verts = points[f"v3d_c.{entity}"].shape[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -44,6 +45,6 @@ def save_mesh(
         check_finite(f"{path}: colors", colors)
         bytes_per_vertex = np.round(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8)
     mesh = trimesh.Trimesh(verts, faces, vertex_colors=bytes_per_vertex, process=False)
-    content = mesh.export(file_type=kind)
+    content: Any = mesh.export(file_type=kind)
     with atomic_write(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)

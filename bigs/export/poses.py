@@ -65,7 +65,7 @@ def save_poses(path: str | Path, poses: ClipPoses) -> None:
         arrays |= {f"object_{field}": np.asarray(values) for field, values in poses.object._asdict().items()}
     _check(str(path), arrays)
     content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
+    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
     with atomic_write(path) as file:
         file.write(content.getbuffer())
 

@@ -63,8 +63,7 @@ def evaluate(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, 
     pred = _matched(pred, gt)
     scores = {key: _mean_of_finite(values) for key, values in _frame_scores(pred, gt).items()}
     scores["clip_scale"] = trajectory_scale(pred, gt)
-    if pred.object_verts is not None and gt.object_verts is not None:
-        scores |= _aligned_object_scores(pred, gt)
+    scores |= _aligned_object_scores(pred, gt)
     return {key: scores[key] for key in METRICS if key in scores}
 
 
@@ -164,25 +163,24 @@ def _change(metric: Metric, values: list[float]) -> str:
 def _frame_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, np.ndarray]:
     scores: dict[str, np.ndarray] = {}
     scale = trajectory_scale(pred, gt)
-    has_object = pred.object_verts is not None and gt.object_verts is not None
+    pred_object, gt_object = pred.object_verts, gt.object_verts
     sides = _common_sides(pred, gt)
     for side in sides:
         s = side[0]
         scores[f"mpjpe_ra_{s}"] = mpjpe(pred.joints[side], gt.joints[side])
         scores[f"wrist_{s}"] = wrist_error(pred.joints[side], gt.joints[side], scale)
         scores[f"wrist_unscaled_{s}"] = wrist_error(pred.joints[side], gt.joints[side])
-        if has_object:
-            relative = _per_frame_shape(
-                pred.object_verts, pred.joints[side][:, 0], gt.object_verts, gt.joints[side][:, 0]
-            )
+        if pred_object is not None and gt_object is not None:
+            wrists = pred.joints[side][:, 0], gt.joints[side][:, 0]
+            relative = _per_frame_shape(pred_object, wrists[0], gt_object, wrists[1])
             scores[f"cd_{s}_sq"], scores[f"cd_{s}"] = relative["squared"], relative["root"]
     if len(sides) == len(SIDES):
         for both in ("mpjpe_ra_{}", "wrist_{}", "cd_{}_sq", "cd_{}"):
             if both.format("r") in scores:
                 scores[both.format("h")] = 0.5 * (scores[both.format("r")] + scores[both.format("l")])
-    if has_object:
+    if pred_object is not None and gt_object is not None:
         camera = np.zeros((len(gt.frame_names), 3))
-        placed = _per_frame_shape(scale * pred.object_verts, camera, gt.object_verts, camera)
+        placed = _per_frame_shape(scale * pred_object, camera, gt_object, camera)
         scores["f5_cam"], scores["f10_cam"] = placed["f5"], placed["f10"]
     return scores
 
@@ -196,6 +194,8 @@ def _per_frame_shape(
 
 
 def _aligned_object_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, float]:
+    if pred.object_verts is None or gt.object_verts is None:
+        return {}
     known = np.flatnonzero(np.isfinite(gt.object_verts).all(axis=(1, 2)))
     if len(known) == 0 or not np.isfinite(pred.object_verts[known[0]]).all():
         return {}

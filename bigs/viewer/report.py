@@ -28,7 +28,8 @@ h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; }
 img, video { max-width: 100%; height: auto; }
 figure { margin: 1em 0; } figcaption { opacity: .75; }
 table { border-collapse: collapse; } th, td { padding: .2em .9em; border-bottom: 1px solid #8886; }
-td { text-align: right; font-variant-numeric: tabular-nums; } th, td:first-child { text-align: left; }
+td { text-align: right; font-variant-numeric: tabular-nums; } th { text-align: right; }
+th:first-child, td:first-child { text-align: left; }
 .curves { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 1em; }
 svg text { font: 10px system-ui, sans-serif; fill: currentColor; }
 svg .name { font-weight: bold; font-size: 12px; }
@@ -132,7 +133,8 @@ def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
     for name in names:
         known = [(x, row[name]) for x, row in zip(positions, numbers, strict=True) if name in row]
         if len(known) > 1:
-            plots.append(line_plot(name, *zip(*known, strict=True), borders=borders[1:]))
+            x, y = zip(*known, strict=True)
+            plots.append(line_plot(name, x, y, borders[1:]))
     return [plot for plot in plots if plot]
 
 
