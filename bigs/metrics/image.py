@@ -90,7 +90,7 @@ def ssim_map(pred: torch.Tensor, gt: torch.Tensor, window: int = 11, sigma: floa
 
 
 class _SsimMap(torch.autograd.Function):
-    """The map and its hand-derived gradient: about a third faster than leaving it to autograd.
+    """The map and its hand-derived gradient: three quarters of the time that autograd takes.
 
     With the blurs a = G pred, b = G gt, s = G (pred² + gt²), p = G (pred gt), the map is
     (2ab + C1) (2(p - ab) + C2) / ((a² + b² + C1) (s - a² - b² + C2)). Only the sum of the two second moments
