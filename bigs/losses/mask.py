@@ -16,9 +16,7 @@ def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
     return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
 
 
-def amodal_silhouette(
-    alpha: Tensor, own: Tensor, hidden: Tensor, weight: Tensor | float = 1.0
-) -> Tensor:
+def amodal_silhouette(alpha: Tensor, own: Tensor, hidden: Tensor) -> Tensor:
     """One subject, rendered alone, against its own visible mask; where others may hide it, anything goes.
 
     A pixel whose area belongs to the subject by `own` and to possible occluders by `hidden` allows any alpha
@@ -28,11 +26,10 @@ def amodal_silhouette(
         alpha: [B, H, W] rendered coverage.
         own: [B, H, W] visible share of each pixel in [0, 1].
         hidden: [B, H, W] share in which the subject may be hidden.
-        weight: [B, H, W] or a number, how far to trust each pixel.
     """
     missing = (own - alpha).clamp_min(0.0)
     excess = (alpha - own - hidden).clamp_min(0.0)
-    return (weight * (missing.square() + excess.square())).sum() / own.sum().clamp_min(1.0)
+    return (missing.square() + excess.square()).sum() / own.sum().clamp_min(1.0)
 
 
 def label_difference(pred: Tensor, labels: Tensor) -> Tensor:

@@ -134,14 +134,13 @@ class HandSplats(nn.Module):
         )
 
 
-def silhouette_hand(model: HandModel, sigma: float, inset: float, colors: Tensor) -> CanonicalHand:
+def silhouette_hand(model: HandModel, sigma: float, inset: float) -> CanonicalHand:
     """Opaque isotropic Gaussians on the template's vertices: enough for silhouettes, and few.
 
     Args:
         model: the right hand.
         sigma: standard deviation, metres.
         inset: metres by which centres go in along the normal, so that the soft outline falls on the surface.
-        colors: [V, D] whatever the image shall show per vertex.
     """
     normals = vertex_normals(model.v_template.numpy().astype(np.float64), model.faces.numpy())
     count = len(model.v_template)
@@ -153,7 +152,7 @@ def silhouette_hand(model: HandModel, sigma: float, inset: float, colors: Tensor
         None,
         torch.full((count, 3), sigma),
         torch.ones(count),
-        colors,
+        torch.ones(count, 1),
     )
 
 

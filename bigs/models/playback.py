@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bigs.checks import InputError
-from bigs.export.atomic import atomic_write
+from bigs.atomic import atomic_write
 from bigs.hand.lbs import pose_corrective
 from bigs.models.hand_splats import CanonicalHand, skin_hand
 from bigs.models.object_splats import CanonicalObject, pose_object

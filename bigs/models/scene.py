@@ -57,6 +57,7 @@ class Scene(nn.Module):
         self.width, self.height = width, height
         self.hand_splats = nn.ModuleDict(dict(hand_splats))
         self.betas = nn.ParameterDict({side: nn.Parameter(value) for side, value in betas.items()})
+        self.base_betas = {side: value.clone() for side, value in betas.items()}
         self.hand_poses = nn.ModuleDict(dict(hand_poses))
         self.object_splats = object_splats
         self.object_poses = object_poses

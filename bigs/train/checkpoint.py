@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from bigs.checks import InputError
-from bigs.export.atomic import atomic_write
+from bigs.atomic import atomic_write
 from bigs.models.scene import Scene
 from bigs.train.loop import StageState
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,9 +18,9 @@ import bigs
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.hand import HandModel
-from bigs.models.hand_splats import CanonicalHand, pose_hand, silhouette_hand
+from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.scene import Scene
-from bigs.raster import rasterization
+from bigs.train.background import unknown_occluders
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage, Stage
 from bigs.train.initial import build_scene, touching_frames
@@ -30,7 +31,7 @@ from bigs.train.terms import Evidence
 from bigs.types import Side
 
 # Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
-SILHOUETTE_SIGMA = 0.0025
+SILHOUETTE_SIGMA = 0.0022
 
 
 @dataclass
@@ -72,12 +73,13 @@ def fit(
     report = FitReport()
     torch.manual_seed(config.seed)
     began = time.perf_counter()
-    scene = build_scene(clip, hand_models, config.initial, config.hand, config.object)
+    unknown = unknown_occluders(clip)
+    scene = build_scene(clip, unknown, hand_models, config.initial, config.hand, config.object)
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
     first = position.stage if position else 0
-    sources = _EvidenceSource(clip, scene, config)
+    sources = _EvidenceSource(clip, unknown, scene, config)
 
     for index, stage in enumerate(config.stages):
         if index < first:
@@ -156,8 +158,9 @@ def run_digest(clip: Clip, scene: Scene, config: RunConfig) -> str:
 class _EvidenceSource:
     """Makes each stage's evidence; what several stages share is made once, when first asked for."""
 
-    def __init__(self, clip: Clip, scene: Scene, config: RunConfig) -> None:
+    def __init__(self, clip: Clip, unknown: np.ndarray, scene: Scene, config: RunConfig) -> None:
         self.clip = clip
+        self.unknown = unknown
         self.scene = scene
         self.config = config
         self.box = crop_box(clip)
@@ -168,24 +171,16 @@ class _EvidenceSource:
             for side in scene.sides
         }
         self._targets: dict[float, Targets] = {}
-        self._trust: dict[Side, float] | None = None
 
     def evidence(self, stage: OptimizeStage) -> Evidence:
         targets = self.targets(stage.image_scale)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
-        if self._trust is None:
-            self._trust = {
-                side: forearm_trust(self.scene, side, silhouettes[side], targets)
-                for side in self.scene.sides
-            }
-        return Evidence(
-            targets, self.touching, silhouettes, self._trust, self.config.contact, self.config.raster
-        )
+        return Evidence(targets, self.touching, silhouettes, self.config.contact, self.config.raster)
 
     def targets(self, scale: float) -> Targets:
         if scale not in self._targets:
             # One resolution at a time: a stage that returns to an earlier one is rare, memory is not.
-            self._targets = {scale: load_targets(self.clip, scale, self.box)}
+            self._targets = {scale: load_targets(self.clip, self.unknown, scale, self.box)}
         return self._targets[scale]
 
     def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
@@ -198,36 +193,12 @@ class _EvidenceSource:
         depth = self.scene.hand_poses[side].position.base_log_depth.exp().median()
         pixel = float(depth / targets.K[0, 0])
         spread = (SILHOUETTE_SIGMA**2 + self.config.raster.eps2d * pixel**2) ** 0.5
-        return silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread, forearm_end(model)[:, None])
+        return silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread)
 
 
 # Centres go in by this many standard deviations of a Gaussian as it appears in the image. Opaque neighbours
 # overlap, so their common alpha falls to one half well outside the centres.
-INSET = 1.6
-
-
-def forearm_end(model: HandModel) -> Tensor:
-    """How much each vertex [V] belongs to the wrist's forearm end, 0 to 1, in rest pose (fingers along -x)."""
-    beyond = model.v_template[:, 0] - model.rest_joints(torch.zeros(10))[0, 0]
-    return torch.sigmoid(beyond / 0.004)
-
-
-@torch.no_grad()
-def forearm_trust(scene: Scene, side: Side, hand: CanonicalHand, targets: Targets) -> float:
-    """Whether the mask shows the forearm end of a hand (1) or a sleeve hides it (0).
-
-    Compares, where the start poses put the forearm end, the mask's hand pixels with its background pixels.
-    """
-    frames = torch.arange(scene.n_frames)
-    posed = pose_hand(
-        scene.hand_model(side), hand, scene.hand_betas(side), scene.hand_frames(side, frames), side
-    )
-    out = rasterization(*posed, torch.eye(4)[None], targets.K[None], targets.width, targets.height)
-    forearm = out.colors[:, 0, ..., 0]
-    own = (forearm * targets.shares[side]).sum()
-    background = (forearm * (1.0 - targets.foreground)).sum()
-    shown = float(own / (own + background).clamp_min(1e-6))
-    return min(max((shown - 0.4) / 0.3, 0.0), 1.0)
+INSET = 1.85
 
 
 def check_plan(config: RunConfig) -> None:

@@ -144,8 +144,13 @@ def _smooth_positions(positions: Tensor, trust: Tensor, sigma: float) -> Tensor:
     return torch.cat([rays * depth, depth], dim=1)
 
 
-def object_surface(clip: Clip, start: ObjectStart, config: InitialConfig) -> DistanceGrid:
-    """The object's surface: visual hull of the masks blended with the points' planes."""
+def object_surface(
+    clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialConfig
+) -> DistanceGrid:
+    """The object's surface: visual hull of the masks blended with the points' planes.
+
+    `unknown` [T, H, W] (bool) marks unlabelled occluders.
+    """
     size = (start.points.max(0) - start.points.min(0)).max()
     lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
     grid = empty_grid(lower, upper, config.surface_resolution)
@@ -153,7 +158,9 @@ def object_surface(clip: Clip, start: ObjectStart, config: InitialConfig) -> Dis
     labels = np.stack([clip.mask(t) for t in usable])
     # Whatever is not background may hide the object, so the object may be there.
     hull = VisualHull(
-        np.stack([silhouette_distance(frame != 0) for frame in labels]),
+        np.stack(
+            [silhouette_distance((frame != 0) | hiding) for frame, hiding in zip(labels, unknown[usable], strict=True)]
+        ),
         clip.K,
         start.rotations[usable].numpy(),
         start.centers[usable].numpy(),
@@ -176,6 +183,7 @@ def object_surface(clip: Clip, start: ObjectStart, config: InitialConfig) -> Dis
 
 def build_scene(
     clip: Clip,
+    unknown: np.ndarray,
     hand_models: Mapping[Side, HandModel],
     initial: InitialConfig,
     hand: HandSplatsConfig,
@@ -185,6 +193,7 @@ def build_scene(
 
     Args:
         clip: the loaded clip.
+        unknown: [T, H, W] bool, unlabelled occluders (see `background`).
         hand_models: both sides' models in their files' own conventions.
     """
     starts = {
@@ -199,7 +208,7 @@ def build_scene(
     )
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
-        grid = object_surface(clip, start, initial)
+        grid = object_surface(clip, unknown, start, initial)
         verts, faces = extract_mesh(grid)
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
         object_parts = {

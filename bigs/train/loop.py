@@ -127,13 +127,13 @@ def run_stage(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        state = _advance(stage, state, float(loss))
+        state = _advance(stage, state, float(loss.detach()))
         after_step(
             StageProgress(
                 state.step,
                 stage.steps,
-                {name: float(value) for name, value in terms.items()},
-                float(loss),
+                {name: float(value.detach()) for name, value in terms.items()},
+                float(loss.detach()),
                 time.perf_counter() - began,
             ),
             state,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bigs.data.base import Clip
+from bigs.train.background import share_per_pixel
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 
@@ -18,6 +19,7 @@ class Targets:
 
     images: Tensor  # [T, H, W, 3] in [0, 1]
     shares: dict[Entity, Tensor]  # [T, H, W] share of each pixel that shows the entity
+    unknown: Tensor  # [T, H, W] share of each pixel in which something unlabelled may hide a subject
     K: Tensor  # [3, 3] intrinsics of the crop
     width: int
     height: int
@@ -28,9 +30,9 @@ class Targets:
         return torch.stack(list(self.shares.values())).sum(0).clamp(max=1.0)
 
     def hidden(self, entity: Entity) -> Tensor:
-        """Share of each pixel [T, H, W] in which another entity may hide this one."""
+        """Share of each pixel [T, H, W] in which something else may hide this entity."""
         others = [share for other, share in self.shares.items() if other != entity]
-        return torch.stack(others).sum(0) if others else torch.zeros_like(self.shares[entity])
+        return torch.stack([self.unknown, *others]).sum(0).clamp(max=1.0)
 
 
 def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:
@@ -53,24 +55,30 @@ def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:
     )
 
 
-def load_targets(clip: Clip, scale: float, box: tuple[int, int, int, int]) -> Targets:
-    """Read the clip's frames inside `box` and shrink them by area to `scale` times their size."""
+def load_targets(
+    clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, int, int, int]
+) -> Targets:
+    """Read the clip's frames inside `box` and shrink them by area to `scale` times their size.
+
+    `unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size.
+    """
     x0, y0, x1, y1 = box
     width, height = (max(1, round(scale * n)) for n in (x1 - x0, y1 - y0))
     labels = np.stack([clip.mask(t)[y0:y1, x0:x1] for t in range(len(clip))])
     images = np.stack([clip.image(t)[y0:y1, x0:x1] for t in range(len(clip))])
     full = torch.from_numpy(images).permute(0, 3, 1, 2)
     # Frame by frame: a whole clip in float at full size would be the largest array of the run.
-    small = torch.cat([_shrink(frame[None].float() / 255.0, height, width) for frame in full])
+    small = torch.cat(
+        [
+            torch.nn.functional.interpolate(
+                frame[None].float() / 255.0, (height, width), mode="bilinear", antialias=True
+            )
+            for frame in full
+        ]
+    )
     present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
     shares = {
-        entity: torch.cat(
-            [
-                _shrink(torch.from_numpy(frame == MASK_VALUES[entity])[None, None].float(), height, width)
-                for frame in labels
-            ]
-        )[:, 0]
-        for entity in present
+        entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present
     }
     # Pixel centres lie at +0.5, so image coordinates scale without an offset.
     sx, sy = width / (x1 - x0), height / (y1 - y0)
@@ -80,14 +88,11 @@ def load_targets(clip: Clip, scale: float, box: tuple[int, int, int, int]) -> Ta
     K[0, 2] -= sx * x0
     K[1, 2] -= sy * y0
     return Targets(
-        small.permute(0, 2, 3, 1).contiguous(), shares, torch.as_tensor(K, dtype=torch.float32), width, height
+        small.permute(0, 2, 3, 1).contiguous(),
+        shares,
+        share_per_pixel(unknown[:, y0:y1, x0:x1], height, width),
+        torch.as_tensor(K, dtype=torch.float32),
+        width,
+        height,
     )
 
-
-def _shrink(images: Tensor, height: int, width: int) -> Tensor:
-    """[B, C, H, W] to [B, C, height, width], every output pixel the mean of the area it covers."""
-    if images.shape[-2:] == (height, width):
-        return images
-    return torch.nn.functional.interpolate(
-        images, (height, width), mode="bilinear", antialias=True, align_corners=False
-    )

@@ -29,8 +29,7 @@ class Evidence:
 
     targets: Targets
     touching: dict[Side, Tensor]  # [T] 1 where the masks of hand and object meet
-    silhouettes: dict[Side, CanonicalHand]  # cheap hands whose colour channel marks the forearm end
-    forearm_trust: dict[Side, float]  # 0 where a sleeve hides the forearm, 1 where the mask shows it
+    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands, of this resolution
     contact: str  # "center" or "surface"
     settings: RasterSettings
 
@@ -181,12 +180,8 @@ def silhouette(step: Step) -> Tensor:
             scene.hand_frames(side, step.frames),
             side,
         )
-        out = step.render(posed)
-        forearm = out.colors[..., 0].detach()
-        # A sleeve hides the forearm but is labelled background: what sticks out there is no error.
-        weight = 1.0 - (1.0 - evidence.forearm_trust[side]) * forearm
         hidden = evidence.targets.hidden(side)[step.frames]
-        return amodal_silhouette(out.alphas[..., 0], step.share(side), hidden, weight)
+        return amodal_silhouette(step.render(posed).alphas[..., 0], step.share(side), hidden)
 
     return _mean(one(side) for side in step.scene.sides)
 
@@ -241,7 +236,14 @@ def orient_prior(step: Step) -> Tensor:
 
 
 def pose_prior(step: Step) -> Tensor:
-    return _mean(squared_norm(poses.pose) for poses in step.scene.hand_poses.values())
+    return _mean(squared_norm(poses.pose + poses.pose_bias) for poses in step.scene.hand_poses.values())
+
+
+def betas_prior(step: Step) -> Tensor:
+    """Squared change of shape from the start, in the units of betas."""
+    return _mean(
+        squared_norm(step.scene.betas[side] - step.scene.base_betas[side]) for side in step.scene.betas
+    )
 
 
 def object_prior(step: Step) -> Tensor:
@@ -311,6 +313,7 @@ TERMS: dict[str, Callable[[Step], Tensor]] = {
     "object_acceleration": object_acceleration,
     "orient_prior": orient_prior,
     "pose_prior": pose_prior,
+    "betas_prior": betas_prior,
     "object_prior": object_prior,
     "rigid": rigid,
     "contact": contact,

@@ -1,0 +1,141 @@
+"""Configurations as plain data: written beside a run, read back strictly, and changed by path."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bigs.checks import InputError
+from bigs.train.config import RunConfig, ScaleSearchStage
+
+
+def to_plain(config: Any) -> Any:
+    """A dataclass as dicts, lists and scalars; a plan's stages become a dict by name."""
+    if dataclasses.is_dataclass(config):
+        return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, tuple) and config and all(dataclasses.is_dataclass(item) for item in config):
+        return {item.name: {k: v for k, v in to_plain(item).items() if k != "name"} for item in config}
+    if isinstance(config, tuple):
+        return [to_plain(item) for item in config]
+    return config
+
+
+def from_plain(plain: Any, where: str = "config") -> RunConfig:
+    """Build a `RunConfig` from plain data.
+
+    Raises:
+        InputError: an unknown key or a value of the wrong type, named by its path.
+    """
+    return _build(RunConfig, plain, where)
+
+
+def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
+    """A configuration with `path=value` changes, such as `raster.eps2d=0.2` or `stages.contact.steps=10`.
+
+    A loss weight or learning rate may be added this way; every other key must exist.
+
+    Raises:
+        InputError: no such path, or a value of the wrong type.
+    """
+    plain = to_plain(config)
+    for change in changes:
+        path, separator, text = change.partition("=")
+        *parents, last = path.split(".")
+        node = plain
+        for parent in parents:
+            if not isinstance(node, dict) or parent not in node:
+                raise InputError(f"--set {change}: expected a path in the configuration, found no {parent!r}")
+            node = node[parent]
+        open_ended = bool(parents) and parents[-1] in ("lrs", "weights")
+        if not separator or not isinstance(node, dict) or (last not in node and not open_ended):
+            known = f" (there are {', '.join(node)})" if isinstance(node, dict) else ""
+            raise InputError(f"--set {change}: expected path=value with a known path, found no {last!r}{known}")
+        node[last] = yaml.safe_load(text)
+    return from_plain(plain, "--set")
+
+
+def save_config(path: Path, config: RunConfig, extra: dict[str, Any]) -> None:
+    """Write the resolved configuration and, above it, what else identifies the run."""
+    path.write_text(yaml.safe_dump({**extra, "config": to_plain(config)}, sort_keys=False))
+
+
+def load_config(path: Path) -> RunConfig:
+    """Read a configuration that `save_config` wrote.
+
+    Raises:
+        InputError: missing, not YAML, or not a configuration.
+    """
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: expected a configuration file, found none ({error.strerror})") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from error
+    if not isinstance(data, dict) or "config" not in data:
+        raise InputError(f"{path}: expected a key 'config', found {type(data).__name__} without it")
+    return from_plain(data["config"], str(path))
+
+
+def _build(kind: Any, plain: Any, where: str) -> Any:
+    """Check `plain` against the annotation `kind` and build the value."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return _build_dataclass(kind, plain, where)
+    if origin is typing.Literal:
+        if plain not in arguments:
+            raise InputError(f"{where}: expected one of {', '.join(map(str, arguments))}, found {plain!r}")
+        return plain
+    if origin is tuple:
+        return _build_tuple(arguments, plain, where)
+    if origin is dict:
+        if not isinstance(plain, dict):
+            raise InputError(f"{where}: expected a mapping, found {plain!r}")
+        return {str(key): _build(arguments[1], value, f"{where}.{key}") for key, value in plain.items()}
+    if kind is float and isinstance(plain, int) and not isinstance(plain, bool):
+        return float(plain)
+    if not isinstance(plain, kind) or (kind in (int, float) and isinstance(plain, bool)):
+        raise InputError(f"{where}: expected {kind.__name__}, found {plain!r}")
+    return plain
+
+
+def _build_tuple(arguments: tuple[Any, ...], plain: Any, where: str) -> tuple[Any, ...]:
+    item = arguments[0]
+    if isinstance(item, types.UnionType):  # the stages of a plan
+        if not isinstance(plain, dict):
+            raise InputError(f"{where}: expected stages by name, found {plain!r}")
+        return tuple(_build_stage(item, name, stage, f"{where}.{name}") for name, stage in plain.items())
+    if not isinstance(plain, list | tuple) or (arguments[-1] is not ... and len(plain) != len(arguments)):
+        raise InputError(f"{where}: expected {len(arguments)} values, found {plain!r}")
+    return tuple(_build(item, value, f"{where}[{i}]") for i, value in enumerate(plain))
+
+
+def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> Any:
+    if not isinstance(plain, dict):
+        raise InputError(f"{where}: expected a stage, found {plain!r}")
+    searches = {f.name for f in dataclasses.fields(ScaleSearchStage)} - {"name", "step"}
+    kind = ScaleSearchStage if searches & set(plain) else typing.get_args(kinds)[0]
+    return _build_dataclass(kind, {"name": name, **plain}, where)
+
+
+def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
+    if not isinstance(plain, dict):
+        raise InputError(f"{where}: expected a mapping, found {plain!r}")
+    hints = typing.get_type_hints(kind)
+    for key in plain:
+        if key not in hints:
+            raise InputError(f"{where}: expected keys out of {', '.join(hints)}, found {key!r}")
+    required = [
+        f.name
+        for f in dataclasses.fields(kind)
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    ]
+    for key in required:
+        if key not in plain:
+            raise InputError(f"{where}: expected a key {key!r}, found {', '.join(plain) or 'nothing'}")
+    return kind(**{key: _build(hints[key], value, f"{where}.{key}") for key, value in plain.items()})
