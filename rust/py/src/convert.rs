@@ -14,11 +14,9 @@ pub(crate) fn slice<'py, T: Element>(
     name: &str,
     array: &Bound<'py, PyAny>,
 ) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
-    let array = array.cast::<PyArrayDyn<T>>().map_err(|_| {
-        PyTypeError::new_err(format!(
-            "{name}: expected one floating dtype for all arrays"
-        ))
-    })?;
+    let array = array
+        .cast::<PyArrayDyn<T>>()
+        .map_err(|_| PyTypeError::new_err(format!("{name}: expected one floating dtype for all arrays")))?;
     Ok(array.readonly())
 }
 
@@ -56,21 +54,13 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
                 .enumerate()
                 .map(|(index, name)| slice(name, &arrays.get_item(index)?))
                 .collect::<PyResult<_>>()?,
-            backgrounds: optional(7)?
-                .map(|item| slice("backgrounds", &item))
-                .transpose()?,
-            pixel_mask: optional(8)?
-                .map(|item| slice("pixel_mask", &item))
-                .transpose()?,
+            backgrounds: optional(7)?.map(|item| slice("backgrounds", &item)).transpose()?,
+            pixel_mask: optional(8)?.map(|item| slice("pixel_mask", &item)).transpose()?,
         })
     }
 
     /// The same as borrowed slabs, and the sizes they imply.
-    pub(crate) fn inputs(
-        &self,
-        width: usize,
-        height: usize,
-    ) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
+    pub(crate) fn inputs(&self, width: usize, height: usize) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
         let slabs = |index: usize| slabs(NAMES[index], &self.floats[index]);
         let inputs = BatchInputs {
             means: slabs(0)?,
@@ -130,10 +120,7 @@ fn wider(a: usize, b: usize) -> usize {
     if a == 1 { b } else { a }
 }
 
-fn slabs<'a, U: Element>(
-    name: &str,
-    array: &'a PyReadonlyArrayDyn<'_, U>,
-) -> PyResult<Slabs<'a, U>> {
+fn slabs<'a, U: Element>(name: &str, array: &'a PyReadonlyArrayDyn<'_, U>) -> PyResult<Slabs<'a, U>> {
     let shape = array.shape();
     if shape.len() < 3 {
         return Err(PyValueError::new_err(format!(

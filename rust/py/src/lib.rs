@@ -95,10 +95,7 @@ fn mode_named(name: &str) -> PyResult<RenderMode> {
 }
 
 /// Runs the engine without the interpreter lock; a panic, which would be a bug, becomes a `RuntimeError`.
-fn run<R: Send>(
-    py: Python<'_>,
-    work: impl FnOnce() -> Result<R, RasterError> + Send,
-) -> PyResult<R> {
+fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + Send) -> PyResult<R> {
     py.detach(|| catch_unwind(AssertUnwindSafe(work)))
         .map_err(|_| PyRuntimeError::new_err("the rasteriser failed; please report this as a bug"))?
         .map_err(value_error)
@@ -124,9 +121,7 @@ fn forward<'py, T: Scalar>(
         array(py, images.means2d.into_flattened(), [views, n, 2])?,
         array(py, images.depths, [views, n])?,
         array(py, images.radii.into_flattened(), [views, n, 2])?,
-        RasterState {
-            kept: T::keep(state),
-        },
+        RasterState { kept: T::keep(state) },
     )
         .into_pyobject(py)
 }
@@ -171,8 +166,7 @@ fn backward<'py, T: Scalar>(
     );
     let (v_colors, v_alphas) = (v_colors.as_slice()?, v_alphas.as_slice()?);
     let gradients = run(py, || {
-        Batch::new_trusted(shape, inputs, settings, mode)?
-            .render_vjp(state, v_colors, v_alphas, wanted)
+        Batch::new_trusted(shape, inputs, settings, mode)?.render_vjp(state, v_colors, v_alphas, wanted)
     })?;
     (
         gradient(py, gradients.means),
@@ -204,15 +198,7 @@ fn rasterize_backward<'py>(
     wanted: [bool; 7],
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, mode, size) = (settings.into(), mode_named(render_mode)?, (width, height));
-    let [
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        backgrounds,
-    ] = wanted;
+    let [means, quats, scales, opacities, colors, viewmats, backgrounds] = wanted;
     let wanted = Wanted {
         means,
         quats,

@@ -54,6 +54,7 @@ mod real;
 mod render;
 mod settings;
 mod sort;
+pub mod stages;
 mod tiles;
 
 pub use batch::{

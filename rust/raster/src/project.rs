@@ -35,6 +35,7 @@ pub(crate) struct Splat<T> {
 }
 
 /// The splats a camera sees, in the order of the Gaussians.
+#[derive(Debug)]
 pub(crate) struct Projected<T> {
     pub(crate) ids: Vec<u32>,
     pub(crate) splats: Vec<Splat<T>>,

@@ -7,7 +7,7 @@ use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp};
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
 use crate::kernel::{Channels, MOMENTS};
-use crate::project::{Projected, ScreenInfo, SplatGradient, project, project_vjp};
+use crate::project::{Projected, ScreenInfo, Splat, SplatGradient, project, project_vjp};
 use crate::real::Real;
 use crate::settings::{Limits, RasterSettings, RenderMode};
 use crate::tiles::{TileBins, TileGrid, bin_tiles, sort_by_depth};
@@ -35,7 +35,7 @@ pub(crate) struct Image<'a, T> {
 #[derive(Debug)]
 pub(crate) struct ViewState<T> {
     ids: Vec<u32>,
-    splats: Vec<crate::project::Splat<T>>,
+    splats: Vec<Splat<T>>,
     bins: TileBins,
     canvas: Canvas<T>,
 }
@@ -79,11 +79,11 @@ fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channel
     }
 }
 
-fn scene<'a, T: Real>(
+pub(crate) fn scene<'a, T: Real>(
     view: &View<'a, T>,
     mode: RenderMode,
     limits: &'a Limits<T>,
-    splats: &'a [crate::project::Splat<T>],
+    splats: &'a [Splat<T>],
     ids: &'a [u32],
     bins: &'a TileBins,
 ) -> Scene<'a, T> {

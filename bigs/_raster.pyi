@@ -1,0 +1,55 @@
+"""The compiled engine. Use `bigs.raster`, which checks shapes and knows torch."""
+
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bigs.raster.settings import RasterSettings
+
+__version__: str
+
+# Every array is [entries or 1, cameras or 1, ...], C-contiguous and of one floating dtype:
+# means [.., N, 3], quats [.., N, 4], scales [.., N, 3], opacities [.., N], colors [.., N, D], viewmats [.., 4, 4],
+# Ks [.., 3, 3], backgrounds [.., D] or None, pixel_mask [.., H, W] of bool or None.
+_Arrays = tuple[
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any] | None,
+    NDArray[np.bool_] | None,
+]
+
+@final
+class RasterState:
+    """What the forward pass keeps for the backward pass. Opaque; usable any number of times."""
+
+    def counters(self) -> dict[str, int]:
+        """Work done and skipped in the forward pass, summed over the views."""
+
+def rasterize_forward(
+    arrays: _Arrays, width: int, height: int, settings: RasterSettings, render_mode: str
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.int32], RasterState]:
+    """Render a batch: colors [V, H, W, D], alphas [V, H, W, 1], means2d [V, N, 2], depths [V, N], radii [V, N, 2]."""
+
+def rasterize_backward(
+    state: RasterState,
+    arrays: _Arrays,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+    render_mode: str,
+    v_colors: NDArray[Any],
+    v_alphas: NDArray[Any],
+    wanted: list[bool],
+) -> tuple[
+    NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int
+]:
+    """Flat gradients of the seven differentiable inputs and the number of tiles without incoming gradient."""
+
+def default_settings() -> dict[str, Any]:
+    """The engine's own defaults, by the names of `RasterSettings`."""

@@ -1,0 +1,209 @@
+//! The engine against a naive renderer and against finite differences of itself.
+
+mod support;
+
+use bigs_raster::{Camera, GaussianGrads, RasterSettings, RenderMode, Renderer};
+use support::{Random, Scene, VIEWMAT, camera, naive, relative};
+
+#[test]
+fn images_match_the_naive_renderer() {
+    for (n, channels, width, height, seed) in [
+        (1, 3, 20, 20, 1),
+        (40, 3, 33, 17, 2),
+        (200, 4, 64, 48, 3),
+        (100, 11, 40, 41, 4),
+        (30, 1, 5, 90, 5),
+    ] {
+        for settings in [
+            RasterSettings::default(),
+            RasterSettings {
+                tile_size: 4,
+                ..Default::default()
+            },
+            RasterSettings {
+                alpha_threshold: 0.0,
+                min_transmittance: 0.0,
+                ..Default::default()
+            },
+            RasterSettings {
+                max_alpha: 0.6,
+                eps2d: 0.1,
+                ..Default::default()
+            },
+        ] {
+            let scene = Scene::<f64>::random(n, channels, seed);
+            let (colors, alphas) = naive(&scene, VIEWMAT, width, height, &settings);
+            let renderer = Renderer::new(&settings, RenderMode::Rgb).unwrap();
+            let frame = renderer
+                .render(&scene.view(), &camera(VIEWMAT, width, height), None)
+                .unwrap();
+            assert!(relative(&frame.colors, &colors) < 1e-12);
+            assert!(relative(&frame.alphas, &alphas) < 1e-12);
+        }
+    }
+}
+
+#[test]
+fn single_precision_stays_close() {
+    let double = Scene::<f64>::random(200, 3, 7);
+    let single = Scene::<f32>::random(200, 3, 7);
+    let (colors, alphas) = naive(&double, VIEWMAT, 64, 48, &RasterSettings::default());
+    let renderer = Renderer::new(&RasterSettings::default(), RenderMode::Rgb).unwrap();
+    let frame = renderer
+        .render(&single.view(), &camera(VIEWMAT, 64, 48), None)
+        .unwrap();
+    assert!(relative(&frame.colors, &colors) < 2e-6);
+    assert!(relative(&frame.alphas, &alphas) < 2e-6);
+}
+
+#[test]
+fn depth_is_a_channel() {
+    let scene = Scene::<f64>::random(60, 3, 8);
+    let camera = camera(VIEWMAT, 40, 30);
+    let settings = RasterSettings::default();
+    let render = |mode| {
+        Renderer::new(&settings, mode)
+            .unwrap()
+            .render(&scene.view(), &camera, None)
+            .unwrap()
+    };
+    let both = render(RenderMode::RgbDepth);
+    let mut painted = scene.clone();
+    for (id, color) in painted.colors.chunks_exact_mut(3).enumerate() {
+        color[0] = both.depths[id];
+    }
+    let painted = Renderer::new(&settings, RenderMode::Rgb)
+        .unwrap()
+        .render(&painted.view(), &camera, None)
+        .unwrap();
+    let alone = render(RenderMode::Depth);
+    let expected = render(RenderMode::ExpectedDepth);
+    for pixel in 0..40 * 30 {
+        let depth = both.colors[pixel * 4 + 3];
+        assert_eq!(depth, painted.colors[pixel * 3]);
+        assert_eq!(depth, alone.colors[pixel]);
+        let alpha = both.alphas[pixel];
+        assert!((expected.colors[pixel] * alpha - depth).abs() < 1e-12);
+    }
+}
+
+/// A scene, a camera and a background as one flat vector, so that every entry can be moved.
+fn perturbed(
+    scene: &Scene<f64>,
+    viewmat: [[f64; 4]; 4],
+    background: [f64; 3],
+    at: usize,
+    h: f64,
+) -> (Scene<f64>, [[f64; 4]; 4], [f64; 3]) {
+    let (mut scene, mut viewmat, mut background) = (scene.clone(), viewmat, background);
+    let mut entries: Vec<&mut f64> = scene
+        .means
+        .as_flattened_mut()
+        .iter_mut()
+        .chain(scene.quats.as_flattened_mut())
+        .chain(scene.scales.as_flattened_mut())
+        .chain(&mut scene.opacities)
+        .chain(&mut scene.colors)
+        .chain(viewmat.as_flattened_mut()[..12].iter_mut())
+        .chain(&mut background)
+        .collect();
+    *entries[at] += h;
+    (scene, viewmat, background)
+}
+
+fn flat(grads: &GaussianGrads<f64>) -> Vec<f64> {
+    let parts = [
+        grads.means.as_flattened(),
+        grads.quats.as_flattened(),
+        grads.scales.as_flattened(),
+        &grads.opacities,
+        &grads.colors,
+        grads.viewmat.as_flattened(),
+        &grads.background,
+    ];
+    parts.concat()
+}
+
+#[test]
+fn gradients_are_finite_differences() {
+    for (mode, antialiased) in [
+        (RenderMode::Rgb, false),
+        (RenderMode::RgbDepth, true),
+        (RenderMode::RgbExpectedDepth, false),
+    ] {
+        // Away from cliffs: every pair counts and no pixel stops.
+        let settings = RasterSettings {
+            alpha_threshold: 0.0,
+            min_transmittance: 0.0,
+            antialiased,
+            ..Default::default()
+        };
+        let (width, height) = (19, 13);
+        let mut scene = Scene::<f64>::random(5, 3, 11);
+        if mode.expects_depth() {
+            // Wide enough that alpha is nowhere near the 1e-10 below which expected depth is no quotient.
+            scene.scales.as_flattened_mut().iter_mut().for_each(|s| *s *= 4.0);
+        }
+        let background = [0.3, 0.9, 0.1];
+        let renderer = Renderer::<f64>::new(&settings, mode).unwrap();
+        let mut r = Random::new(3);
+        let channels = if mode.has_depth() { 4 } else { 3 };
+        let v_colors: Vec<f64> = (0..width * height * channels)
+            .map(|_| r.uniform(-1.0, 1.0))
+            .collect();
+        let v_alphas: Vec<f64> = (0..width * height).map(|_| r.uniform(-1.0, 1.0)).collect();
+        let loss = |scene: &Scene<f64>, viewmat, background: [f64; 3]| {
+            let camera: Camera<f64> = camera(viewmat, width, height);
+            let frame = renderer
+                .render(&scene.view(), &camera, Some(&background))
+                .unwrap();
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            dot(&frame.colors, &v_colors) + dot(&frame.alphas, &v_alphas)
+        };
+        let camera = camera(VIEWMAT, width, height);
+        let frame = renderer
+            .render(&scene.view(), &camera, Some(&background))
+            .unwrap();
+        let grads = renderer
+            .render_vjp(
+                &scene.view(),
+                &camera,
+                Some(&background),
+                &frame,
+                &v_colors,
+                &v_alphas,
+            )
+            .unwrap();
+        let grads = flat(&grads);
+        let h = 1e-5;
+        for (at, &gradient) in grads.iter().enumerate() {
+            let value = |h| {
+                let (scene, viewmat, background) = perturbed(&scene, VIEWMAT, background, at, h);
+                loss(&scene, viewmat, background)
+            };
+            let difference = (value(h) - value(-h)) / (2.0 * h);
+            let scale = 1.0 + difference.abs();
+            assert!(
+                (gradient - difference).abs() < 1e-5 * scale,
+                "{mode:?} {at}: {gradient} {difference}"
+            );
+        }
+    }
+}
+
+/// Runs this file's other tests again with the kernels of lesser CPUs.
+#[test]
+fn every_cpu_level_passes() {
+    for level in ["avx512", "avx2", "neon", "baseline"] {
+        let run = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["images_match", "single_precision", "depth_is", "gradients_are"])
+            .env("BIGS_RASTER_SIMD", level)
+            .output()
+            .unwrap();
+        assert!(
+            run.status.success(),
+            "{level}: {}",
+            String::from_utf8_lossy(&run.stdout)
+        );
+    }
+}
