@@ -74,7 +74,7 @@ def rasterization(
     settings = RasterSettings() if settings is None else settings
     check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("backend", backend, ("auto", "rust", "torch", "gsplat"))
-    tensors: dict[str, torch.Tensor | None] = {
+    tensors = {
         "means": means,
         "quats": quats,
         "scales": scales,
@@ -82,8 +82,9 @@ def rasterization(
         "colors": colors,
         "viewmats": viewmats,
         "Ks": Ks,
-        "backgrounds": backgrounds,
     }
+    if backgrounds is not None:
+        tensors["backgrounds"] = backgrounds
     _check_kind(tensors, pixel_mask)
     batch = _batch_of(tensors, pixel_mask, width, height)
     _check_cameras(viewmats, Ks)
@@ -94,8 +95,7 @@ def rasterization(
             raise InputError("means: expected CPU tensors for backend 'rust', found a CUDA tensor")
         return _render_rust(tensors, pixel_mask, batch, settings, render_mode)
     for name, tensor in tensors.items():
-        if tensor is not None:
-            check_finite(name, tensor)
+        check_finite(name, tensor)
     expanded = _expanded(tensors, batch)
     mask = None if pixel_mask is None else pixel_mask.expand(*batch.shape, *pixel_mask.shape[-3:])
     if backend == "gsplat":
@@ -113,11 +113,9 @@ class _Batch(NamedTuple):
     colors_per_camera: bool
 
 
-def _check_kind(tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tensor | None) -> None:
+def _check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None) -> None:
     means = tensors["means"]
     for name, tensor in tensors.items():
-        if tensor is None and name == "backgrounds":
-            continue
         if not isinstance(tensor, torch.Tensor):
             raise InputError(f"{name}: expected a torch tensor, found {type(tensor).__name__}")
         if tensor.dtype not in (torch.float32, torch.float64):
@@ -137,18 +135,19 @@ def _check_kind(tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tenso
 
 
 def _batch_of(
-    tensors: dict[str, torch.Tensor | None], pixel_mask: torch.Tensor | None, width: int, height: int
+    tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None, width: int, height: int
 ) -> _Batch:
     for name, size in (("width", width), ("height", height)):
         if not isinstance(size, int | np.integer) or size < 1:
             raise InputError(f"{name}: expected a positive whole number of pixels, found {size!r}")
-    n = tensors["means"].shape[-2] if tensors["means"].ndim >= 2 else "N"
-    cameras = tensors["viewmats"].shape[-3] if tensors["viewmats"].ndim >= 3 else "C"
-    channels = tensors["colors"].shape[-1] if tensors["colors"].ndim >= 2 else "D"
+    # A tensor with too few axes to tell a size fails its own check below, whatever this says.
+    n = tensors["means"].shape[-2] if tensors["means"].ndim >= 2 else 1
+    cameras = tensors["viewmats"].shape[-3] if tensors["viewmats"].ndim >= 3 else 1
+    channels = tensors["colors"].shape[-1] if tensors["colors"].ndim >= 2 else 1
     if channels == 0 or cameras == 0:
         name, what = ("colors", "channel") if channels == 0 else ("viewmats", "camera")
         raise InputError(f"{name}: expected at least one {what}, found shape {list(tensors[name].shape)}")
-    trailing: dict[str, tuple[int | str, ...]] = {
+    trailing: dict[str, tuple[int, ...]] = {
         "means": (n, 3),
         "quats": (n, 4),
         "scales": (n, 3),
@@ -160,14 +159,9 @@ def _batch_of(
         "pixel_mask": (cameras, height, width),
     }
     leading: dict[str, tuple[int, ...]] = {}
-    for name, tensor in {**tensors, "pixel_mask": pixel_mask}.items():
-        if tensor is None:
-            continue
+    for name, tensor in (tensors if pixel_mask is None else {**tensors, "pixel_mask": pixel_mask}).items():
         expected = trailing[name]
-        found = tuple(tensor.shape[max(tensor.ndim - len(expected), 0) :])
-        if len(found) < len(expected) or any(
-            isinstance(e, int) and e != f for e, f in zip(expected, found, strict=True)
-        ):
+        if tuple(tensor.shape[max(tensor.ndim - len(expected), 0) :]) != expected:
             shown = ", ".join(map(str, ("...", *expected)))
             raise InputError(f"{name}: expected shape [{shown}], found {list(tensor.shape)}")
         leading[name] = tuple(tensor.shape[: tensor.ndim - len(expected)])
@@ -209,24 +203,23 @@ def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
 
 def _slabs(tensor: torch.Tensor, batch: tuple[int, ...], axes: int, camera_axis: bool) -> torch.Tensor:
     """The tensor as [entries or 1, cameras or 1, ...]; `axes` counts its own axes without the camera's."""
-    lead = tensor.shape[: tensor.ndim - axes - camera_axis]
+    lead = tuple(tensor.shape[: tensor.ndim - axes - camera_axis])
     own = tensor.shape[len(lead) :]
-    if math.prod(lead) != 1 and tuple(lead) != batch:
+    if math.prod(lead) != 1 and lead != batch:
         tensor = tensor.expand(*batch, *own)
         lead = batch
     return tensor.reshape(math.prod(lead), *(own if camera_axis else (1, *own)))
 
 
 def _render_rust(
-    tensors: dict[str, torch.Tensor | None],
+    tensors: dict[str, torch.Tensor],
     pixel_mask: torch.Tensor | None,
     batch: _Batch,
     settings: RasterSettings,
     render_mode: RenderMode,
 ) -> RenderOutput:
-    def slabs(name: str, axes: int, camera_axis: bool = False) -> torch.Tensor | None:
-        tensor = tensors[name]
-        return None if tensor is None else _slabs(tensor, batch.shape, axes, camera_axis)
+    def slabs(name: str, axes: int, camera_axis: bool = False) -> torch.Tensor:
+        return _slabs(tensors[name], batch.shape, axes, camera_axis)
 
     inputs = (
         slabs("means", 2),
@@ -235,7 +228,7 @@ def _render_rust(
         slabs("opacities", 1),
         slabs("colors", 2, batch.colors_per_camera),
         slabs("viewmats", 2, True),
-        slabs("backgrounds", 1, True),
+        slabs("backgrounds", 1, True) if "backgrounds" in tensors else None,
     )
     mask = None if pixel_mask is None else _slabs(pixel_mask, batch.shape, 2, True)
     try:
@@ -245,8 +238,7 @@ def _render_rust(
     except ValueError as error:
         # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
         for name, tensor in tensors.items():
-            if tensor is not None:
-                check_finite(name, tensor)
+            check_finite(name, tensor)
         raise InputError(str(error)) from None
     lead = (*batch.shape, batch.cameras)
     for name in ("means2d", "depths", "radii"):
@@ -256,17 +248,16 @@ def _render_rust(
     )
 
 
-def _expanded(tensors: dict[str, torch.Tensor | None], batch: _Batch) -> dict[str, torch.Tensor | None]:
+def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torch.Tensor]:
     """All inputs with all batch axes."""
     axes = {"opacities": 1, "viewmats": 3, "Ks": 3, "colors": 2 + batch.colors_per_camera}
     return {
-        name: None if x is None else x.expand(*batch.shape, *x.shape[x.ndim - axes.get(name, 2) :])
-        for name, x in tensors.items()
+        name: x.expand(*batch.shape, *x.shape[x.ndim - axes.get(name, 2) :]) for name, x in tensors.items()
     }
 
 
 def _render_torch(
-    tensors: dict[str, torch.Tensor | None],
+    tensors: dict[str, torch.Tensor],
     pixel_mask: torch.Tensor | None,
     batch: _Batch,
     settings: RasterSettings,
@@ -275,13 +266,22 @@ def _render_torch(
     results = []
     for index in np.ndindex(*batch.shape, batch.cameras):
         entry = index[:-1]
-        gaussians = [tensors[name][entry] for name in ("means", "quats", "scales", "opacities")]
-        colors = tensors["colors"][index if batch.colors_per_camera else entry]
-        cameras = [tensors[name][index] for name in ("viewmats", "Ks")]
-        optional = [None if x is None else x[index] for x in (tensors["backgrounds"], pixel_mask)]
+        background = tensors["backgrounds"][index] if "backgrounds" in tensors else None
         results.append(
             reference.rasterize_view(
-                *gaussians, colors, *cameras, batch.width, batch.height, settings, *optional, render_mode
+                tensors["means"][entry],
+                tensors["quats"][entry],
+                tensors["scales"][entry],
+                tensors["opacities"][entry],
+                tensors["colors"][index if batch.colors_per_camera else entry],
+                tensors["viewmats"][index],
+                tensors["Ks"][index],
+                width=batch.width,
+                height=batch.height,
+                settings=settings,
+                background=background,
+                pixel_mask=None if pixel_mask is None else pixel_mask[index],
+                render_mode=render_mode,
             )
         )
     lead = (*batch.shape, batch.cameras)

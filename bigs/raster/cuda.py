@@ -27,7 +27,7 @@ def _gsplat() -> ModuleType:
 
 
 def rasterize(
-    tensors: dict[str, torch.Tensor | None],
+    tensors: dict[str, torch.Tensor],
     pixel_mask: torch.Tensor | None,
     width: int,
     height: int,
@@ -47,7 +47,7 @@ def rasterize(
                 f"settings.{name}: expected gsplat's constant {defaults[name]} for backend 'gsplat', "
                 f"found {getattr(settings, name)}"
             )
-    backgrounds = tensors["backgrounds"]
+    backgrounds = tensors.get("backgrounds")
     colors, alphas, info = gsplat.rasterization(
         **{name: tensor for name, tensor in tensors.items() if name != "backgrounds"},
         width=width,

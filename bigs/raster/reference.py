@@ -148,9 +148,8 @@ def _composite(
     screen: _Screen, values: torch.Tensor, width: int, height: int, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Blend values [M, D] front to back (paper Eq. 2): [H·W, D] and the transmittance left over [H·W]."""
-    like = {"dtype": values.dtype, "device": values.device}
-    rows, columns = torch.meshgrid(torch.arange(height, **like), torch.arange(width, **like), indexing="ij")
-    pixels = torch.stack([columns, rows], dim=-1).reshape(1, -1, 2) + 0.5
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([columns, rows], dim=-1).reshape(1, -1, 2).to(values) + 0.5
     offsets = pixels - screen.means2d[:, None, :]  # [M, P, 2]
     exponents = -0.5 * torch.einsum("mpi,mij,mpj->mp", offsets, torch.linalg.inv(screen.covs2d), offsets)
     alphas = (screen.opacities[:, None] * exponents.exp()).clamp(max=settings.max_alpha)

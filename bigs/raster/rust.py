@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
-from bigs import _raster
+import bigs._raster as _raster
 from bigs.raster.settings import RasterSettings
 
 # The differentiable inputs, in the order of the engine's arrays; there Ks follows viewmats.
@@ -67,9 +67,9 @@ class _Rasterize(torch.autograd.Function):
             ctx.state,
             _engine_arrays(tuple(inputs), (Ks, pixel_mask)),
             *ctx.call,
-            _array(v_colors),
-            _array(v_alphas),
-            wanted,
+            v_colors=_array(v_colors),
+            v_alphas=_array(v_alphas),
+            wanted=wanted,
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
         return None, None, None, *map(_gradient_of, inputs, wanted, map(torch.from_numpy, gradients))

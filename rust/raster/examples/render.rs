@@ -49,12 +49,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let path = std::env::args().nth(1).unwrap_or_else(|| "splats.png".into());
     let s = torus(300, 120);
     let gaussians = Gaussians::new(&s.means, &s.quats, &s.scales, &s.opacities, &s.colors, 3)?;
-    // Tilted by 50° about x, 3.2 away.
-    let (sin, cos) = 50f32.to_radians().sin_cos();
+    // From above: turned by 130° about x, 4 away.
+    let (sin, cos) = 130f32.to_radians().sin_cos();
     let viewmat = [
         [1.0, 0.0, 0.0, 0.0],
         [0.0, cos, -sin, 0.0],
-        [0.0, sin, cos, 3.2],
+        [0.0, sin, cos, 4.0],
         [0.0, 0.0, 0.0, 1.0],
     ];
     let k = Intrinsics {
