@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from bigs.raster.settings import RasterSettings
 
+__all__ = ["RasterState", "__version__", "default_settings", "rasterize_backward", "rasterize_forward"]
+
 __version__: str
 
 # Every array is [entries or 1, cameras or 1, ...], C-contiguous and of one floating dtype:
-# means [.., N, 3], quats [.., N, 4], scales [.., N, 3], opacities [.., N], colors [.., N, D], viewmats [.., 4, 4],
-# Ks [.., 3, 3], backgrounds [.., D] or None, pixel_mask [.., H, W] of bool or None.
+# means [.., N, 3], quats [.., N, 4], scales [.., N, 3], opacities [.., N], colors [.., N, D],
+# viewmats [.., 4, 4], Ks [.., 3, 3], backgrounds [.., D] or None, pixel_mask [.., H, W] of bool or None.
 _Arrays = tuple[
     NDArray[Any],
     NDArray[Any],
@@ -34,7 +36,7 @@ class RasterState:
 def rasterize_forward(
     arrays: _Arrays, width: int, height: int, settings: RasterSettings, render_mode: str
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.int32], RasterState]:
-    """Render a batch: colors [V, H, W, D], alphas [V, H, W, 1], means2d [V, N, 2], depths [V, N], radii [V, N, 2]."""
+    """Colors [V, H, W, D], alphas [V, H, W, 1], means2d [V, N, 2], depths [V, N], radii [V, N, 2], state."""
 
 def rasterize_backward(
     state: RasterState,

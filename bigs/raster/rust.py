@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,17 +24,16 @@ Inputs = tuple[
 ]
 
 
-def _array(tensor: torch.Tensor | None) -> np.ndarray | None:
+def _array(tensor: torch.Tensor) -> np.ndarray:
     """A numpy view of a tensor; copies only what is not contiguous."""
-    return None if tensor is None else tensor.detach().contiguous().numpy()
+    return tensor.detach().contiguous().numpy()
 
 
-def _engine_arrays(
-    inputs: tuple[torch.Tensor | None, ...], constants: tuple[torch.Tensor | None, ...]
-) -> tuple:
+def _engine_arrays(inputs: Sequence[torch.Tensor | None], constants: Sequence[torch.Tensor | None]) -> Any:
     *gaussians_and_views, backgrounds = inputs
     Ks, pixel_mask = constants
-    return tuple(map(_array, (*gaussians_and_views, Ks, backgrounds, pixel_mask)))
+    tensors = (*gaussians_and_views, Ks, backgrounds, pixel_mask)
+    return tuple(None if tensor is None else _array(tensor) for tensor in tensors)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -63,13 +63,17 @@ class _Rasterize(torch.autograd.Function):
         if v_alphas is None:
             v_alphas = v_colors.new_zeros(*ctx.image_shape[:-1], 1)
         wanted = list(ctx.needs_input_grad[3:])
+        width, height, settings, render_mode = ctx.call
         *gradients, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
-            _engine_arrays(tuple(inputs), (Ks, pixel_mask)),
-            *ctx.call,
-            v_colors=_array(v_colors),
-            v_alphas=_array(v_alphas),
-            wanted=wanted,
+            _engine_arrays(inputs, (Ks, pixel_mask)),
+            width,
+            height,
+            settings,
+            render_mode,
+            _array(v_colors),
+            _array(v_alphas),
+            wanted,
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
         return None, None, None, *map(_gradient_of, inputs, wanted, map(torch.from_numpy, gradients))
