@@ -103,10 +103,14 @@ class VisualHull:
 
     def outward(self, points: np.ndarray, step: float) -> np.ndarray:
         """Directions [N, 3] in which the hull's distance grows, by central differences of `step` metres."""
-        slopes = [self.distance(points + step * axis) - self.distance(points - step * axis) for axis in np.eye(3)]
+        slopes = [
+            self.distance(points + step * axis) - self.distance(points - step * axis) for axis in np.eye(3)
+        ]
         # The slope is exactly zero deep inside; there the direction from the middle decides.
         away = points - points.mean(0)
-        return np.stack(slopes, axis=-1) + 1e-3 * away / np.linalg.norm(away, axis=-1, keepdims=True).clip(1e-9)
+        return np.stack(slopes, axis=-1) + 1e-3 * away / np.linalg.norm(away, axis=-1, keepdims=True).clip(
+            1e-9
+        )
 
 
 def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:

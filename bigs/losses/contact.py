@@ -17,16 +17,20 @@ def center_contact(object_centers: Tensor, wrists: Tensor, touching: Tensor) -> 
     return (distance * touching).sum() / touching.sum().clamp_min(1.0)
 
 
-def nearest_mean(distances: Tensor, count: int) -> Tensor:
-    """Mean [B] of the `count` smallest absolute values of `distances` [B, V]."""
-    return distances.abs().topk(min(count, distances.shape[1]), dim=1, largest=False).values.mean(1)
+def deepest_mean(distances: Tensor, count: int) -> Tensor:
+    """Mean [B] of the `count` smallest signed values of `distances` [B, V].
+
+    Zero when the part of a hand that reaches furthest lies on the surface; the smallest *absolute* values
+    would also be near zero for a hand that is stuck deep inside, where some vertices always cross it.
+    """
+    return distances.topk(min(count, distances.shape[1]), dim=1, largest=False).values.mean(1)
 
 
 def surface_contact(distances: Tensor, touching: Tensor, count: int = 30, reach: float = 0.01) -> Tensor:
-    """Draws the nearest part of a hand to the object's surface where the image shows touch.
+    """Draws the part of a hand that reaches furthest onto the object's surface where the image shows touch.
 
-    d / (d + reach) of the mean distance of the nearest vertices: it saturates, so that a frame whose pose is
-    wrong altogether does not outweigh the rest.
+    |d| / (|d| + reach) of its mean distance d: it saturates, so that a frame whose pose is wrong altogether
+    does not outweigh the rest.
 
     Args:
         distances: [B, V] signed distances of the hand's vertices from the object, metres.
@@ -34,8 +38,8 @@ def surface_contact(distances: Tensor, touching: Tensor, count: int = 30, reach:
         count: how many vertices count as the touching part.
         reach: metres at which the pull has fallen by half.
     """
-    nearest = nearest_mean(distances, count)
-    return (nearest / (nearest + reach) * touching).sum() / touching.sum().clamp_min(1.0)
+    depth = deepest_mean(distances, count).abs()
+    return (depth / (depth + reach) * touching).sum() / touching.sum().clamp_min(1.0)
 
 
 def penetration(distances: Tensor, tolerance: float = 0.001) -> Tensor:

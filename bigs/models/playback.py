@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -12,8 +12,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from bigs.checks import InputError
 from bigs.atomic import atomic_write
+from bigs.checks import InputError
+from bigs.geometry.rotations import matrix_to_axis_angle
+from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
 from bigs.models.hand_splats import CanonicalHand, skin_hand
 from bigs.models.object_splats import CanonicalObject, pose_object
@@ -34,6 +36,13 @@ class HandPlayback:
     bones: Tensor  # [T, 16, 4, 4] of the canonical (right) hand, mirrored camera for a left hand
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
+    # The same poses in that side's own MANO convention: x_cam = MANO(global_orient, hand_pose, betas) + transl
+    # about the rest wrist joint; a left hand's model is the mirrored right one.
+    global_orient_aa: Tensor  # [T, 3]
+    hand_pose_aa: Tensor  # [T, 15, 3] relative to the model's mean pose
+    transl: Tensor  # [T, 3] metres
+    betas: Tensor  # [10]
+    v_posed: Tensor  # [V, 3] or [T, V, 3]: shape and pose correctives, not skinned
 
 
 @dataclass(frozen=True)
@@ -115,6 +124,14 @@ def record(
         pose = scene.hand_frames(side, frames)
         verts, joints = scene.hand_points(side, frames)
         splats = canonical[side]
+        orient, fingers = matrix_to_axis_angle(pose.global_orient), model.pose_axis_angle(pose.hand_pose)
+        transl = pose.wrist - model.rest_joints(betas)[0]
+        v_posed = model.rest_vertices(betas)
+        if model.has_posedirs:
+            v_posed = v_posed + model.corrective(pose.hand_pose)
+        if side == "left":
+            orient, fingers = mirror_axis_angle(orient), mirror_axis_angle(fingers)
+            transl, v_posed = mirror_points(transl), mirror_points(v_posed)
         hands[side] = HandPlayback(
             joints,
             verts,
@@ -124,6 +141,11 @@ def record(
             splats._replace(
                 points=splats.points + splats.shapedirs @ betas, shapedirs=splats.shapedirs[..., :0]
             ),
+            orient,
+            fingers,
+            transl,
+            betas.detach(),
+            v_posed,
         )
     obj = None
     if scene.object_splats is not None:
@@ -141,12 +163,12 @@ def save_playback(path: Path, playback: Playback) -> None:
     """Write a playback as one safetensors file."""
     tensors: dict[str, Tensor] = {"K": playback.K}
     for side, hand in playback.hands.items():
-        named = {key: getattr(hand, key) for key in ("joints", "verts", "faces", "bones", "hand_pose")}
+        named = {f.name: getattr(hand, f.name) for f in fields(hand) if f.name != "splats"}
         named |= {f"splats.{key}": value for key, value in hand.splats._asdict().items() if value is not None}
         tensors |= {f"{side}.{key}": value for key, value in named.items()}
     if playback.object is not None:
         obj = playback.object
-        named = {key: getattr(obj, key) for key in ("rotations", "centers", "scale", "verts", "faces")}
+        named = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name != "splats"}
         named |= {f"splats.{key}": value for key, value in obj.splats._asdict().items()}
         tensors |= {f"object.{key}": value for key, value in named.items()}
     metadata = {
@@ -185,9 +207,9 @@ def load_playback(path: Path) -> Playback:
     for side in SIDES:
         splats = part(f"{side}.splats.")
         if splats:
-            fields = {key: splats.get(key) for key in CanonicalHand._fields}
+            whole = {key: splats.get(key) for key in CanonicalHand._fields}
             rest = {k: v for k, v in part(f"{side}.").items() if not k.startswith("splats.")}
-            hands[side] = HandPlayback(**rest, splats=CanonicalHand(**fields))
+            hands[side] = HandPlayback(**rest, splats=CanonicalHand(**whole))
     obj = None
     if "object.verts" in tensors:
         rest = {k: v for k, v in part("object.").items() if not k.startswith("splats.")}

@@ -110,9 +110,7 @@ class Scene(nn.Module):
     def object_frames(self, frames: Tensor) -> ObjectFrames:
         return self.object_poses(frames)
 
-    def posed(
-        self, entity: Entity, canonical: CanonicalHand | CanonicalObject, frames: Tensor
-    ) -> Gaussians:
+    def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject, frames: Tensor) -> Gaussians:
         """Gaussians of one entity at `frames` [B], camera space: means [B, N, 3], quats [B, N, 4]."""
         if entity == "object":
             return pose_object(canonical, self.object_frames(frames))
@@ -127,9 +125,7 @@ class Scene(nn.Module):
     def hand_points(self, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices [B, V, 3] and 21 joints [B, 21, 3] of a hand in camera space, metres."""
         pose = self.hand_frames(side, frames)
-        out = self.hand_model(side)(
-            self.hand_betas(side), pose.hand_pose, pose.global_orient, pose.wrist
-        )
+        out = self.hand_model(side)(self.hand_betas(side), pose.hand_pose, pose.global_orient, pose.wrist)
         if side == "left":
             return mirror_points(out.vertices), mirror_points(out.joints)
         return out.vertices, out.joints

@@ -10,8 +10,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from bigs.checks import InputError
 from bigs.atomic import atomic_write
+from bigs.checks import InputError
 from bigs.models.scene import Scene
 from bigs.train.loop import StageState
 
@@ -26,9 +26,7 @@ class Position(NamedTuple):
     resume: dict[str, Any] | None  # for `loop.run_stage`; None at a stage's start
 
 
-def save_checkpoint(
-    folder: Path, scene: Scene, digest: str, stage: int, state: StageState | None
-) -> None:
+def save_checkpoint(folder: Path, scene: Scene, digest: str, stage: int, state: StageState | None) -> None:
     """Write the state after `state.step` steps of `stage`, or before its first when `state` is None.
 
     Args:

@@ -25,8 +25,8 @@ class OptimizeStage:
     lrs: dict[str, float]
     # Loss terms (see `terms.TERMS`) and their weights; a term that is not listed is not computed.
     weights: dict[str, float]
-    # Size of the images of this stage relative to the clip's.
-    image_scale: float = 1.0
+    # Long side in pixels to which this stage shrinks the clip's images; 0 keeps their size.
+    image_size: int = 0
     # How many frames share one evaluation of the canonical fields; 0 takes the whole clip.
     frames_per_step: int = 0
     # Learning rates fall along a cosine to this share.

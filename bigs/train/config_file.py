@@ -55,7 +55,9 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
         open_ended = bool(parents) and parents[-1] in ("lrs", "weights")
         if not separator or not isinstance(node, dict) or (last not in node and not open_ended):
             known = f" (there are {', '.join(node)})" if isinstance(node, dict) else ""
-            raise InputError(f"--set {change}: expected path=value with a known path, found no {last!r}{known}")
+            raise InputError(
+                f"--set {change}: expected path=value with a known path, found no {last!r}{known}"
+            )
         node[last] = yaml.safe_load(text)
     return from_plain(plain, "--set")
 

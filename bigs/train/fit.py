@@ -21,9 +21,10 @@ from bigs.hand import HandModel
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
+from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage, Stage
-from bigs.train.initial import build_scene, touching_frames
+from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.scale_search import search_object_scale
 from bigs.train.targets import Targets, crop_box, load_targets
@@ -123,9 +124,7 @@ def _optimise(
         if checkpoints and progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             save_checkpoint(checkpoints, scene, digest, index, state)
 
-    return run_stage(
-        scene, stage, sources.evidence(stage), config.seed + 1000 * index, resume, after_step
-    )
+    return run_stage(scene, stage, sources.evidence(stage), config.seed + 1000 * index, resume, after_step)
 
 
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
@@ -170,18 +169,20 @@ class _EvidenceSource:
             else torch.zeros(len(clip))
             for side in scene.sides
         }
-        self._targets: dict[float, Targets] = {}
+        self._targets: dict[int, Targets] = {}
 
     def evidence(self, stage: OptimizeStage) -> Evidence:
-        targets = self.targets(stage.image_scale)
+        targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(targets, self.touching, silhouettes, self.config.contact, self.config.raster)
 
-    def targets(self, scale: float) -> Targets:
-        if scale not in self._targets:
+    def targets(self, size: int) -> Targets:
+        if size not in self._targets:
+            long_side = max(self.clip.width, self.clip.height)
+            scale = min(1.0, size / long_side) if size else 1.0
             # One resolution at a time: a stage that returns to an earlier one is rare, memory is not.
-            self._targets = {scale: load_targets(self.clip, self.unknown, scale, self.box)}
-        return self._targets[scale]
+            self._targets = {size: load_targets(self.clip, self.unknown, scale, self.box)}
+        return self._targets[size]
 
     def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
         """A hand whose outline lies right at this resolution.

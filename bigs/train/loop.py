@@ -103,7 +103,9 @@ def run_stage(
         for entity in entities
         if not set(FIELD_GROUPS["object" if entity == "object" else "hand"]) & set(stage.lrs)
     }
-    needs_canonical = any(name in image_terms or name in ("color", "scale", "lbs", "offset") for name in stage.weights)
+    needs_canonical = any(
+        name in image_terms or name in ("color", "scale", "lbs", "offset") for name in stage.weights
+    )
     with torch.no_grad():
         # A frozen field is evaluated once for the whole stage.
         fixed = scene.canonical(frozen) if needs_canonical else {}

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bigs.fields.triplane import TriplaneConfig
-from bigs.models.hand_splats import HandSplatsConfig
-from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage
-from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
-_POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.03}
+_POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.005}
 
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
@@ -26,7 +22,7 @@ _HANDS_COARSE = OptimizeStage(
         "hand.betas": 0.03,
     },
     weights={"silhouette": 1.0, **_POSE_PRIORS},
-    image_scale=0.125,
+    image_size=60,
     final_lr=0.5,
 )
 _HANDS_FINE = replace(
@@ -42,7 +38,7 @@ _HANDS_FINE = replace(
         "hand.betas": 0.015,
     },
     weights={"silhouette": 1.0, **_POSE_PRIORS, "rigid": 0.03},
-    image_scale=0.25,
+    image_size=120,
     final_lr=0.1,
 )
 _CONTACT = replace(
@@ -66,7 +62,7 @@ _APPEARANCE = OptimizeStage(
         "object.geometry": 5e-4,
     },
     weights={"image": 1.0, "ssim": 0.2, "coverage": 0.2, "scale": 100.0, "lbs": 1000.0},
-    image_scale=0.5,
+    image_size=240,
     frames_per_step=6,
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bigs.losses.contact import nearest_mean
+from bigs.losses.contact import surface_contact
 from bigs.models.scene import Scene
 from bigs.train.config import ScaleSearchStage
 from bigs.types import Side
@@ -17,8 +17,7 @@ def search_object_scale(
 ) -> tuple[float, Tensor, Tensor]:
     """Set the object's scale, which leaves its projection alone, to where the hands touch its surface best.
 
-    The cost of a frame is d / (d + 10 mm) of the mean distance d of the hand's 30 nearest vertices: frames in
-    which a pose is wrong saturate instead of pulling.
+    The cost is the contact term's own.
 
     Returns:
         The chosen factor on the present scale, the factors tried [C] and their costs [C]. The scene is left
@@ -34,12 +33,10 @@ def search_object_scale(
         scale = scene.object_poses.log_scale.exp()
         for side, verts in hands.items():
             distances = scale * scene.object_distance(scene.in_object_frame(verts, frames))
-            nearest = nearest_mean(distances, 30)
-            costs[c] += (nearest / (nearest + 0.01) * touching[side]).sum()
-    total = sum(float(t.sum()) for t in touching.values())
-    if total == 0.0:
+            costs[c] += surface_contact(distances, touching[side]) / len(hands)
+    if not any(bool(t.any()) for t in touching.values()):
         scene.object_poses.log_scale.copy_(start)
         return 1.0, factors, costs
     best = factors[costs.argmin()]
     scene.object_poses.log_scale.copy_(start + best.log())
-    return float(best), factors, costs / total
+    return float(best), factors, costs

@@ -55,9 +55,7 @@ def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:
     )
 
 
-def load_targets(
-    clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, int, int, int]
-) -> Targets:
+def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, int, int, int]) -> Targets:
     """Read the clip's frames inside `box` and shrink them by area to `scale` times their size.
 
     `unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size.
@@ -77,9 +75,7 @@ def load_targets(
         ]
     )
     present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
-    shares = {
-        entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present
-    }
+    shares = {entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present}
     # Pixel centres lie at +0.5, so image coordinates scale without an offset.
     sx, sy = width / (x1 - x0), height / (y1 - y0)
     K = clip.K.copy()
@@ -95,4 +91,3 @@ def load_targets(
         width,
         height,
     )
-

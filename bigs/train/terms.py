@@ -81,9 +81,7 @@ class Step:
     def alone(self, entity: Entity) -> RenderOutput:
         """One subject rendered without the others (the paper's single-subject step)."""
         if entity not in self._alone:
-            self._alone[entity] = self.render(
-                self.scene.posed(entity, self.canonical[entity], self.frames)
-            )
+            self._alone[entity] = self.render(self.scene.posed(entity, self.canonical[entity], self.frames))
         return self._alone[entity]
 
     @cached_property
@@ -107,8 +105,7 @@ class Step:
         """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
         scale = self.scene.object_poses.log_scale.exp()
         return {
-            side: scale
-            * self.scene.object_distance(self.scene.in_object_frame(verts, self.everything))
+            side: scale * self.scene.object_distance(self.scene.in_object_frame(verts, self.everything))
             for side, (verts, _) in self.hands.items()
         }
 
@@ -123,9 +120,7 @@ def _mean(values: Iterable[Tensor]) -> Tensor:
 
 
 def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
-    return _mean(
-        loss(step.alone(entity).colors, step.images, step.share(entity)) for entity in step.entities
-    )
+    return _mean(loss(step.alone(entity).colors, step.images, step.share(entity)) for entity in step.entities)
 
 
 def image_alone(step: Step) -> Tensor:
@@ -206,7 +201,11 @@ def lbs(step: Step) -> Tensor:
 
 def offset(step: Step) -> Tensor:
     """Squared distance, in millimetres, that the field moves the object's Gaussians."""
-    return squared_norm(1e3 * step.canonical["object"].offsets) if "object" in step.canonical else torch.zeros(())
+    return (
+        squared_norm(1e3 * step.canonical["object"].offsets)
+        if "object" in step.canonical
+        else torch.zeros(())
+    )
 
 
 def smooth(step: Step) -> Tensor:

@@ -1,0 +1,42 @@
+"""What a clip holds, before anything is fitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bigs.data.hold import load_hold
+
+
+def describe_clip(path: Path) -> list[tuple[str, str]]:
+    """Facts about a clip as rows of text.
+
+    Raises:
+        InputError: the clip is not as it should be.
+    """
+    clip = load_hold(path)
+    K = clip.K
+    rows = [
+        ("clip", f"{clip.name} ({clip.folder})"),
+        ("frames", f"{len(clip)}, {clip.width} x {clip.height}"),
+        ("camera", f"fx {K[0, 0]:.1f}, fy {K[1, 1]:.1f}, cx {K[0, 2]:.1f}, cy {K[1, 2]:.1f} pixels"),
+    ]
+    for entity, areas in clip.mask_areas.items():
+        track = clip.object if entity == "object" else clip.hands.get(entity)
+        if track is None:
+            rows.append((entity, "absent"))
+            continue
+        shown = areas > 0
+        share = 100.0 * areas[shown].mean() / (clip.width * clip.height) if shown.any() else 0.0
+        text = f"visible in {int(shown.sum())} frames, {share:.1f} % of the image, estimated in {int(track.valid.sum())}"
+        if entity == "object":
+            text += f", {len(track.points)} points"
+        rows.append((entity, text))
+    depths = [
+        (clip.cam_from_world[:, :3, :3] @ track.transl[..., None])[:, 2, 0] + clip.cam_from_world[:, 2, 3]
+        for track in (*clip.hands.values(), *([clip.object] if clip.object else []))
+    ]
+    middle = np.median(np.concatenate(depths))
+    rows.append(("distance", f"{middle:.2f} m, where a pixel covers {1e3 * middle / K[0, 0]:.1f} mm"))
+    return rows

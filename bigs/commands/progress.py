@@ -1,0 +1,57 @@
+"""A progress display with time left, fed by a run's events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from bigs.train.config import OptimizeStage, RunConfig
+
+
+@contextmanager
+def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Show one bar over all stages; yields the function to pass as `listen`.
+
+    The bar counts pixels times frames times steps, which is what time goes with, not steps alone.
+    """
+    cost = {
+        stage.name: (stage.image_size or 480) ** 2 * (stage.frames_per_step or 60)
+        for stage in config.stages
+        if isinstance(stage, OptimizeStage)
+    }
+    total = sum(cost[stage.name] * stage.steps for stage in config.stages if isinstance(stage, OptimizeStage))
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("start values", total=total, detail="")
+        done = 0.0
+
+        def listen(event: dict[str, Any]) -> None:
+            nonlocal done
+            if event["event"] == "stage":
+                place = f"{event['index'] + 1}/{event['stages']}"
+                done = sum(
+                    cost.get(stage.name, 0) * getattr(stage, "steps", 0)
+                    for stage in config.stages[: event["index"]]
+                )
+                progress.update(task, description=f"{place} {event['stage']}", detail="", completed=done)
+            elif event["event"] == "step":
+                progress.update(
+                    task,
+                    completed=done + cost[event["stage"]] * event["step"],
+                    detail=f"step {event['step']}/{event['steps']}, loss {event['loss']:.4f}",
+                )
+            elif event["event"] == "note":
+                progress.console.print(event["text"], highlight=False)
+
+        yield listen

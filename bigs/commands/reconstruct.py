@@ -1,0 +1,219 @@
+"""The main job: a clip goes in, a run folder with hands and object comes out."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import bigs
+from bigs.checks import InputError
+from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
+from bigs.commands.run_folder import (
+    CHECKPOINTS,
+    CONFIG,
+    LOG,
+    METRICS,
+    PREVIEW_PICTURE,
+    PREVIEW_VIDEO,
+    REPORT,
+    write_json,
+    write_outputs,
+)
+from bigs.data.base import Clip
+from bigs.data.ground_truth import load_ground_truth
+from bigs.data.hold import load_hold
+from bigs.hand import load_hand_models
+from bigs.metrics.image import psnr, ssim
+from bigs.metrics.report import comparison_table, evaluate
+from bigs.models.playback import Playback, record
+from bigs.train.config import RunConfig
+from bigs.train.config_file import save_config
+from bigs.train.fit import FitReport, check_plan, fit
+from bigs.train.initial import initial_trajectory
+from bigs.types import HandObjectTrajectory
+from bigs.viewer.preview import contact_sheet, overlay, save_picture, write_video
+from bigs.viewer.report import write_report
+
+# Degrees by which the preview's novel view is turned about the scene.
+_NOVEL_VIEW = 40.0
+_FPS = 30.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What there is to tell after a run."""
+
+    run: Path
+    table: list[tuple[str, ...]]  # scores; the first row is the heading
+    report: FitReport
+    seconds: float
+
+
+def reconstruct(
+    clip_path: Path,
+    out: Path,
+    config: RunConfig,
+    *,
+    hand_model: Path | None = None,
+    ground_truth: Path | None = None,
+    resume: bool = False,
+    listen: Callable[[dict[str, Any]], None] = lambda event: None,
+) -> Outcome:
+    """Reconstruct a clip into a run folder.
+
+    Everything is checked before the folder is touched, so that bad input leaves nothing half written.
+
+    Args:
+        clip_path: a HOLD `build` folder, or the folder that holds it.
+        out: the run folder; made if missing. One that holds a run is refused unless `resume` is set.
+        config: see `bigs.train.presets`.
+        hand_model: folder or file of MANO-format models; None takes the built-in hand.
+        ground_truth: scores the result and the initial estimates; never seen by the optimisation.
+        resume: continue an interrupted run.
+        listen: told of stages, steps and notes, for progress displays.
+
+    Raises:
+        InputError: bad input, in one sentence.
+    """
+    began = time.perf_counter()
+    check_plan(config)
+    clip = load_hold(clip_path)
+    hand_models = load_hand_models(hand_model)
+    truth = None if ground_truth is None else load_ground_truth(ground_truth)
+    if (out / CONFIG).exists() and not resume:
+        raise InputError(f"{out}: expected a new run folder, found a run (pass --resume to continue it)")
+    baseline = initial_trajectory(clip, hand_models)
+    scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
+
+    out.mkdir(parents=True, exist_ok=True)
+    origin = {
+        "bigs": bigs.__version__,
+        "torch": torch.__version__,
+        "clip": str(Path(clip_path).resolve()),
+        "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
+    }
+    save_config(out / CONFIG, config, origin)
+    log: list[dict[str, Any]] = _read_log(out / LOG) if resume else []
+    with (out / LOG).open("a" if resume else "w") as file:
+
+        def log_and_listen(event: dict[str, Any]) -> None:
+            log.append(event)
+            file.write(json.dumps(event) + "\n")
+            file.flush()
+            listen(event)
+
+        scene, report = fit(
+            clip, hand_models, config, checkpoints=out / CHECKPOINTS, resume=resume, listen=log_and_listen
+        )
+        playback = record(scene, clip.name, clip.frame_names, tuple(map(float, clip.normalize_shift)))
+        listen({"event": "note", "stage": "outputs", "text": "writing results"})
+        write_outputs(out, playback)
+        result = _score(clip, playback, truth)
+        scores["result"] = result
+        for line in report.skipped:
+            log_and_listen({"event": "skipped", "text": line})
+    write_json(out / METRICS, scores)
+    table = comparison_table(scores) + _image_rows(scores)
+    _write_preview(out, clip, playback, table, log, report)
+    return Outcome(out, table, report, time.perf_counter() - began)
+
+
+def _read_log(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -> dict[str, float]:
+    """Image scores on the clip's own frames, and the pose and shape scores when there is a truth."""
+    scores = {} if truth is None else evaluate(playback.trajectory(), truth)
+    pairs = []
+    for t in range(len(clip)):
+        mask = torch.from_numpy(clip.mask(t) != 0)
+        if mask.any():
+            color, _ = render_input_view(playback, t)
+            image = torch.from_numpy(clip.image(t)).float() / 255.0
+            pred, target = (x.permute(2, 0, 1)[None] for x in (torch.from_numpy(color).clamp(0, 1), image))
+            pairs.append((float(psnr(pred, target, mask[None])), float(ssim(pred * mask, target * mask))))
+    if pairs:
+        scores["psnr_foreground"], scores["ssim_foreground"] = map(float, np.mean(pairs, axis=0))
+    return scores
+
+
+def _image_rows(scores: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
+    """Rows for what only a rendering has, in the shape of `comparison_table`'s."""
+    labels = {"psnr_foreground": "PSNR of the foreground (dB)", "ssim_foreground": "SSIM of the foreground"}
+    columns = len(scores)
+    rows = []
+    for key, label in labels.items():
+        if key in scores["result"]:
+            cells = ["" for _ in range(columns - 1)] + [f"{scores['result'][key]:.2f}"]
+            rows.append((label, *cells, *([""] if columns > 1 else [])))
+    return rows
+
+
+def _write_preview(
+    out: Path,
+    clip: Clip,
+    playback: Playback,
+    table: list[tuple[str, ...]],
+    log: list[dict[str, Any]],
+    report: FitReport,
+) -> None:
+    """A contact sheet, a video when PyAV is there, and the report around them."""
+    frames = [int(t) for t in np.linspace(0, len(clip) - 1, min(len(clip), 6)).round()]
+    rows: dict[str, list[np.ndarray]] = {"input": [], "render": [], "overlay": [], "turned 40°": []}
+    for t in frames:
+        color, alpha = render_input_view(playback, t)
+        novel, _ = _novel_view(playback, t)
+        for name, image in zip(
+            rows, (clip.image(t), color, overlay(color, alpha, clip.image(t)), novel), strict=True
+        ):
+            rows[name].append(image)
+    sheet = contact_sheet(rows, [f"frame {t}" for t in frames])
+    save_picture(out / PREVIEW_PICTURE, sheet)
+    video: Path | None = out / PREVIEW_VIDEO
+    try:
+        write_video(
+            out / PREVIEW_VIDEO,
+            (
+                np.concatenate(
+                    [clip.image(t) / 255.0, render_input_view(playback, t)[0], _novel_view(playback, t)[0]],
+                    axis=1,
+                )
+                for t in range(len(clip))
+            ),
+            _FPS,
+        )
+    except InputError as missing:
+        report.skipped.append(f"{PREVIEW_VIDEO}: {missing}")
+        video = None
+    write_report(
+        out / REPORT,
+        title=f"{clip.name}: {len(clip)} frames",
+        facts={
+            "frames": f"{len(clip)}, {clip.width} x {clip.height}",
+            "subjects": ", ".join(playback.entities),
+            "Gaussians": str(playback.gaussians([0]).means.shape[1]),
+        },
+        pictures={"input, render, render over input, turned": sheet},
+        video=video,
+        metrics=table,
+        log=[
+            {"stage": e["stage"], "step": e["step"], "loss": e["loss"], **e["terms"]}
+            for e in log
+            if e["event"] == "step"
+        ],
+        timings=report.seconds,
+        skipped=report.skipped,
+    )
+
+
+def _novel_view(playback: Playback, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    viewmat = orbit_camera(playback, frame, _NOVEL_VIEW)
+    return render_frame(playback, frame, viewmat, playback.K, playback.width, playback.height)
