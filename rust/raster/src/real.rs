@@ -47,8 +47,8 @@ pub trait Real:
     fn abs(self) -> Self;
     /// log₂ x
     fn log2(self) -> Self;
-    /// ⌊x⌋
-    fn floor(self) -> Self;
+    /// ⌊x⌋ for 0 ≤ x < 2³¹.
+    fn truncate(self) -> usize;
     /// Neither NaN nor infinite.
     fn is_finite(self) -> bool;
     /// self · a + b in one rounding; slow where the CPU has no such instruction.
@@ -164,8 +164,8 @@ macro_rules! real {
                 <$T>::log2(self)
             }
             #[inline(always)]
-            fn floor(self) -> Self {
-                <$T>::floor(self)
+            fn truncate(self) -> usize {
+                self as i32 as usize
             }
             #[inline(always)]
             fn is_finite(self) -> bool {

@@ -91,15 +91,16 @@ struct Ellipse<T> {
 impl<T: Real> Ellipse<T> {
     fn new(splat: &Splat<T>) -> Self {
         let reach = padded_reach(splat.reach);
-        let tilt = -splat.w12 / splat.w22;
-        let half_height = reach.sqrt() / splat.w22;
+        let (inverse_w11, inverse_w22) = (T::ONE / splat.w11, T::ONE / splat.w22);
+        let tilt = -splat.w12 * inverse_w22;
+        let half_height = reach.sqrt() * inverse_w22;
         Self {
             x: splat.x,
             y: splat.y,
             reach,
             w22: splat.w22,
-            slope: -splat.w12 / splat.w11,
-            inverse_w11: T::ONE / splat.w11,
+            slope: -splat.w12 * inverse_w11,
+            inverse_w11,
             right: half_height * (tilt / (T::ONE + tilt * tilt).sqrt()),
             half_height,
         }
@@ -122,21 +123,21 @@ impl<T: Real> Ellipse<T> {
     }
 }
 
-/// First and one-past-last tile along an axis with a pixel centre in [low, high]; empty ranges are (n, n).
+/// First and one-past-last tile along an axis with a pixel centre in [low, high]; empty ranges are (0, 0).
 #[inline(always)]
 fn tile_range<T: Real>(low: T, high: T, tile_size: usize, pixels: usize) -> (usize, usize) {
-    let (half, slack) = (T::of(0.5), T::of(0.01));
-    let last = T::of(pixels as f64 - 1.0);
-    // −⌊−x⌋ is ⌈x⌉
-    let first_pixel = (-(-(low - half - slack)).floor()).greater(T::ZERO);
-    let last_pixel = (high - half + slack).floor().lesser(last);
-    if !(first_pixel <= last_pixel) {
+    let (half, slack, end) = (T::of(0.5), T::of(0.01), T::of(pixels as f64));
+    // Centre i + ½ is in if low − ½ ≤ i ≤ high − ½. Truncation is the floor, everything being at least 0.
+    let first = (low - half - slack).limit(T::ZERO, end);
+    let whole = first.truncate();
+    let first = whole + usize::from(T::of(whole as f64) < first);
+    let past = (high + half + slack).limit(T::ZERO, end).truncate();
+    if first >= past {
         return (0, 0);
     }
-    (
-        first_pixel.as_f64() as usize / tile_size,
-        last_pixel.as_f64() as usize / tile_size + 1,
-    )
+    // Tile sizes are powers of two; a division would cost more than all the rest.
+    let shift = tile_size.trailing_zeros();
+    (first >> shift, ((past - 1) >> shift) + 1)
 }
 
 /// Lists, for every tile for which `wanted` holds, the splats (in depth order) whose ellipse meets it.
