@@ -367,17 +367,12 @@ pub(crate) struct TileCotangents<'a, T> {
     pub(crate) v_transmittance: &'a TilePlane<T>,
 }
 
-#[inline(always)]
+/// The sum over lanes, by halves. Not inlined: next to its callers' loops it gets vectorised across sums, with gathers.
+#[inline(never)]
 fn horizontal_sum<T: Real>(lanes: &Lanes<T>) -> T {
-    let mut sums = lanes.0;
-    let mut width = LANES / 2;
-    while width > 0 {
-        for i in 0..width {
-            sums[i] += sums[i + width];
-        }
-        width /= 2;
-    }
-    sums[0]
+    let eight: [T; 8] = std::array::from_fn(|i| lanes[i] + lanes[i + 8]);
+    let four: [T; 4] = std::array::from_fn(|i| eight[i] + eight[i + 4]);
+    (four[0] + four[2]) + (four[1] + four[3])
 }
 
 /// Adds, for every splat of the tile, its moments and the gradients of its channels to its slot
@@ -464,12 +459,14 @@ pub(crate) fn backward_tile<T: Real, A: Arithmetic, const K: usize>(
                 }
             }
         }
+        let moments: [T; MOMENTS] = std::array::from_fn(|m| horizontal_sum(&moments[m]));
+        let v_values: [T; K] = std::array::from_fn(|k| horizontal_sum(&v_values[k]));
         let slot = &mut slots[index as usize * stride..][..stride];
-        for (sum, lanes) in slot.iter_mut().zip(&moments) {
-            *sum += horizontal_sum(lanes);
+        for (sum, v) in slot.iter_mut().zip(moments) {
+            *sum += v;
         }
-        for (sum, lanes) in slot[MOMENTS + task.first..][..used].iter_mut().zip(&v_values) {
-            *sum += horizontal_sum(lanes);
+        for (sum, v) in slot[MOMENTS + task.first..][..used].iter_mut().zip(v_values) {
+            *sum += v;
         }
     }
 }
