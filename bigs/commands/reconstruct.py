@@ -95,7 +95,7 @@ def reconstruct(
     out.mkdir(parents=True, exist_ok=True)
     origin = {
         "bigs": bigs.__version__,
-        "torch": torch.__version__,
+        "torch": str(torch.__version__),
         "clip": str(Path(clip_path).resolve()),
         "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
     }
@@ -146,14 +146,16 @@ def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -
 
 
 def _image_rows(scores: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
-    """Rows for what only a rendering has, in the shape of `comparison_table`'s."""
-    labels = {"psnr_foreground": "PSNR of the foreground (dB)", "ssim_foreground": "SSIM of the foreground"}
-    columns = len(scores)
+    """Rows for what only a rendering has, in the shape of `comparison_table`'s: name, unit, scores, change."""
+    labels = {
+        "psnr_foreground": ("PSNR of the foreground", "dB"),
+        "ssim_foreground": ("SSIM of the foreground", ""),
+    }
     rows = []
-    for key, label in labels.items():
+    for key, (label, unit) in labels.items():
         if key in scores["result"]:
-            cells = ["" for _ in range(columns - 1)] + [f"{scores['result'][key]:.2f}"]
-            rows.append((label, *cells, *([""] if columns > 1 else [])))
+            cells = [f"{column[key]:.2f}" if key in column else "" for column in scores.values()]
+            rows.append((label, unit, *cells, *([""] if len(scores) > 1 else [])))
     return rows
 
 

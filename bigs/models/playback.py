@@ -18,6 +18,7 @@ from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
 from bigs.models.hand_splats import CanonicalHand, skin_hand
+from bigs.models.lighting import light
 from bigs.models.object_splats import CanonicalObject, pose_object
 from bigs.models.poses import ObjectFrames
 from bigs.models.scene import Scene, concatenate
@@ -67,6 +68,7 @@ class Playback:
     width: int
     height: int
     normalize_shift: tuple[float, float, float]  # of the clip's file; places HOLD's scaled space
+    light: Tensor | None  # [8, 3] coefficients of `lighting.light`
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
 
@@ -78,11 +80,12 @@ class Playback:
         return len(self.frame_names)
 
     def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
-        """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], colours [N, 3]."""
+        """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours."""
         index = torch.as_tensor(list(frames))
-        return concatenate(
+        whole = concatenate(
             self._posed(entity, index) for entity in (self.entities if entities is None else entities)
         )
+        return whole if self.light is None else light(whole, self.light)
 
     def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
         if entity == "object":
@@ -155,13 +158,23 @@ def record(
             pose.rotations, pose.centers, pose.scale, surface.verts, surface.faces, canonical["object"]
         )
     return Playback(
-        name, frame_names, scene.K, scene.width, scene.height, tuple(map(float, normalize_shift)), hands, obj
+        name,
+        frame_names,
+        scene.K,
+        scene.width,
+        scene.height,
+        tuple(map(float, normalize_shift)),
+        None if scene.lighting is None else scene.lighting.coefficients.detach(),
+        hands,
+        obj,
     )
 
 
 def save_playback(path: Path, playback: Playback) -> None:
     """Write a playback as one safetensors file."""
     tensors: dict[str, Tensor] = {"K": playback.K}
+    if playback.light is not None:
+        tensors["light"] = playback.light
     for side, hand in playback.hands.items():
         named = {f.name: getattr(hand, f.name) for f in fields(hand) if f.name != "splats"}
         named |= {f"splats.{key}": value for key, value in hand.splats._asdict().items() if value is not None}
@@ -222,6 +235,7 @@ def load_playback(path: Path) -> Playback:
         width,
         height,
         tuple(json.loads(metadata["normalize_shift"])),
+        tensors.get("light"),
         hands,
         obj,
     )

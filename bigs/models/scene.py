@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
 from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_hand
+from bigs.models.lighting import Lighting
 from bigs.models.object_splats import CanonicalObject, ObjectSplats, pose_object
 from bigs.models.poses import HandFrames, HandPoses, ObjectFrames, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
@@ -44,6 +45,7 @@ class Scene(nn.Module):
         object_poses: ObjectPoses | None,
         object_surface: ObjectSurface | None,
         object_distance: DistanceField | None,
+        lighting: Lighting | None,
     ) -> None:
         """
         Args:
@@ -51,6 +53,7 @@ class Scene(nn.Module):
             hand_splats, betas: per canonical hand ("right" alone when shared); betas [10].
             hand_poses: per hand of the clip.
             object_splats, object_poses, object_surface, object_distance: all or none.
+            lighting: None gives every Gaussian one colour for all frames.
         """
         super().__init__()
         self.register_buffer("K", K, persistent=False)
@@ -63,6 +66,7 @@ class Scene(nn.Module):
         self.object_poses = object_poses
         self.object_surface = object_surface
         self.object_distance = object_distance
+        self.lighting = lighting
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -111,16 +115,20 @@ class Scene(nn.Module):
         return self.object_poses(frames)
 
     def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject, frames: Tensor) -> Gaussians:
-        """Gaussians of one entity at `frames` [B], camera space: means [B, N, 3], quats [B, N, 4]."""
+        """Gaussians of one entity at `frames` [B], camera space and lit: means [B, N, 3], quats [B, N, 4]."""
         if entity == "object":
-            return pose_object(canonical, self.object_frames(frames))
-        return pose_hand(
+            return self._lit(pose_object(canonical, self.object_frames(frames)))
+        posed = pose_hand(
             self.hand_model(entity),
             canonical,
             self.hand_betas(entity),
             self.hand_frames(entity, frames),
             entity,
         )
+        return self._lit(posed)
+
+    def _lit(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians if self.lighting is None else self.lighting(gaussians)
 
     def hand_points(self, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices [B, V, 3] and 21 joints [B, 21, 3] of a hand in camera space, metres."""
@@ -142,7 +150,7 @@ class Scene(nn.Module):
 
 
 def concatenate(parts: Iterable[Gaussians]) -> Gaussians:
-    """Several subjects' Gaussians as one set; quats without a batch axis are repeated over frames."""
+    """Several subjects' Gaussians as one set; what has no batch axis in one and in another is repeated."""
     parts = list(parts)
     frames = parts[0].means.shape[0]
     return Gaussians(
@@ -150,5 +158,5 @@ def concatenate(parts: Iterable[Gaussians]) -> Gaussians:
         torch.cat([part.quats.expand(frames, *part.quats.shape[-2:]) for part in parts], dim=1),
         torch.cat([part.scales for part in parts]),
         torch.cat([part.opacities for part in parts]),
-        torch.cat([part.colors for part in parts]),
+        torch.cat([part.colors for part in parts], dim=-2),
     )

@@ -24,6 +24,7 @@ from bigs.geometry.surface import (
 )
 from bigs.hand import HandModel, shared_betas
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
+from bigs.models.lighting import Lighting
 from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
@@ -85,6 +86,7 @@ def build_scene(
     initial: InitialConfig,
     hand: HandSplatsConfig,
     obj: ObjectSplatsConfig,
+    lighting: bool,
 ) -> Scene:
     """A scene at its start values.
 
@@ -92,6 +94,8 @@ def build_scene(
         clip: the loaded clip.
         unknown: [T, H, W] bool, unlabelled occluders (see `background`).
         hand_models: both sides' models in their files' own conventions.
+        initial, hand, obj: see those classes.
+        lighting: whether colours depend on the direction a surface faces.
     """
     starts = {
         side: smooth_hand(
@@ -124,6 +128,7 @@ def build_scene(
             side: HandPoses(start.global_orient, start.hand_pose, start.wrist)
             for side, start in starts.items()
         },
+        lighting=Lighting() if lighting else None,
         **object_parts,
     )
 

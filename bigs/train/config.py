@@ -59,6 +59,8 @@ class RunConfig:
     hand: HandSplatsConfig = field(default_factory=HandSplatsConfig)
     object: ObjectSplatsConfig = field(default_factory=ObjectSplatsConfig)
     raster: RasterSettings = field(default_factory=RasterSettings)
+    # Colours follow the direction a surface faces (see `models.lighting`); the paper's are fixed.
+    lighting: bool = True
     # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
     stages: tuple[Stage, ...] = ()

@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from bigs.atomic import atomic_write
 from bigs.checks import InputError
 from bigs.train.config import RunConfig, ScaleSearchStage
 
@@ -64,7 +65,9 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
 
 def save_config(path: Path, config: RunConfig, extra: dict[str, Any]) -> None:
     """Write the resolved configuration and, above it, what else identifies the run."""
-    path.write_text(yaml.safe_dump({**extra, "config": to_plain(config)}, sort_keys=False))
+    text = yaml.safe_dump({**extra, "config": to_plain(config)}, sort_keys=False)
+    with atomic_write(path) as file:
+        file.write(text.encode())
 
 
 def load_config(path: Path) -> RunConfig:

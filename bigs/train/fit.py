@@ -75,7 +75,9 @@ def fit(
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene = build_scene(clip, unknown, hand_models, config.initial, config.hand, config.object)
+    scene = build_scene(
+        clip, unknown, hand_models, config.initial, config.hand, config.object, config.lighting
+    )
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None

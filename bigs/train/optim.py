@@ -17,6 +17,7 @@ _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
     *(f"hand.{name}" for name in (*_HAND_FIELD, "betas", "orient", "pose", "pose_bias", "ray", "depth")),
     *(f"object.{name}" for name in (*_OBJECT_FIELD, "orient", "ray", "depth", "scale")),
+    "scene.lighting",
 )
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in _HAND_FIELD),
@@ -33,7 +34,9 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
     if group not in GROUPS:
         raise InputError(f"stage lrs: expected groups out of {', '.join(GROUPS)}, found {group!r}")
     subject, name = group.split(".")
-    if subject == "hand":
+    if subject == "scene":
+        owners = [] if scene.lighting is None else [scene.lighting]
+    elif subject == "hand":
         if name in _HAND_FIELD:
             owners = [
                 splats.color_logit if name == "color" else getattr(splats, name)

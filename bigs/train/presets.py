@@ -51,7 +51,7 @@ _CONTACT = replace(
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
-    steps=150,
+    steps=100,
     lrs={
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
@@ -60,12 +60,50 @@ _APPEARANCE = OptimizeStage(
         "object.triplane": 1e-2,
         "object.appearance": 2e-3,
         "object.geometry": 5e-4,
+        "scene.lighting": 1e-2,
     },
     weights={"image": 1.0, "ssim": 0.2, "coverage": 0.2, "scale": 100.0, "lbs": 1000.0},
     image_size=240,
     frames_per_step=6,
 )
 
-FAST = RunConfig(stages=(_HANDS_COARSE, _HANDS_FINE, ScaleSearchStage(), _CONTACT, _APPEARANCE))
+_JOINT = OptimizeStage(
+    name="joint",
+    step="interacting-subjects",
+    steps=100,
+    lrs={
+        "hand.orient": 0.002,
+        "hand.pose": 0.002,
+        "hand.ray": 0.0005,
+        "hand.depth": 0.001,
+        "hand.triplane": 5e-3,
+        "hand.appearance": 1e-3,
+        "hand.color": 2e-3,
+        "object.triplane": 5e-3,
+        "object.appearance": 1e-3,
+        "object.geometry": 5e-4,
+        "object.orient": 0.002,
+        "object.ray": 0.0005,
+        "scene.lighting": 5e-3,
+    },
+    weights={
+        "image": 1.0,
+        "ssim": 0.2,
+        "mask": 0.5,
+        "labels": 0.5,
+        "silhouette": 0.5,
+        "scale": 100.0,
+        **_POSE_PRIORS,
+        "rigid": 0.03,
+        "contact": 0.1,
+        "penetration": 0.01,
+        "object_acceleration": 0.005,
+        "object_prior": 0.1,
+    },
+    image_size=240,
+    frames_per_step=6,
+)
+
+FAST = RunConfig(stages=(_HANDS_COARSE, _HANDS_FINE, _APPEARANCE, ScaleSearchStage(), _CONTACT, _JOINT))
 
 PRESETS: dict[str, RunConfig] = {"fast": FAST}

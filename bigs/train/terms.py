@@ -91,7 +91,7 @@ class Step:
         parts = []
         for entity, label in zip(self.entities, labels, strict=True):
             part = self.scene.posed(entity, self.canonical[entity], self.frames)
-            channels = torch.cat([part.colors, label.expand(len(part.colors), -1)], dim=-1)
+            channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
             parts.append(part._replace(colors=channels))
         return self.render(concatenate(parts))
 
