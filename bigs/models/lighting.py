@@ -1,38 +1,53 @@
-"""Light that stands still while hands and object turn in it.
+"""Light that stands still while hands and object turn in it, and shade that comes and goes.
 
 A Gaussian with one fixed colour cannot be lit from above in one frame and from below in the next. Here its
-colour is an albedo times a smooth function of the direction its surface faces in camera space, one function
-for the clip. (The paper has fixed colours; a run may switch this off.)
+colour is an albedo times a smooth function of the direction its surface faces in camera space: one quadratic
+function for the clip, and for each subject and frame a linear one, since a hand that closes over the object
+shades itself. (The paper has fixed colours; a run may switch this off.)
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 
-from bigs.types import Gaussians
+from bigs.types import Entity, Gaussians
 
 
 class Lighting(nn.Module):
-    """exp of a quadratic polynomial of the normal, per colour channel; 1 everywhere at the start.
+    """exp of a polynomial of the normal; 1 everywhere at the start.
 
     Irradiance under distant light is very nearly quadratic in the normal; the exponential keeps it positive.
-    The constant is left out, since the albedo holds it.
+    The clip's function has no constant, since the albedo holds it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, entities: Iterable[Entity], n_frames: int) -> None:
         super().__init__()
-        self.coefficients = nn.Parameter(torch.zeros(8, 3))
+        self.clip = nn.Parameter(torch.zeros(8, 3))
+        # Constant and slope along x, y, z: brightness only, shade has no colour of its own.
+        self.shade = nn.ParameterDict({entity: nn.Parameter(torch.zeros(n_frames, 4)) for entity in entities})
 
-    def forward(self, gaussians: Gaussians) -> Gaussians:
-        """Lit Gaussians: colours [B, N, 3] for albedos [N, 3] and camera-space quats [B, N, 4]."""
-        return light(gaussians, self.coefficients)
+    def forward(self, entity: Entity, gaussians: Gaussians, frames: Tensor) -> Gaussians:
+        """Lit Gaussians of one entity at `frames` [B]; see `light`."""
+        return light(gaussians, self.clip, self.shade[entity][frames])
 
 
-def light(gaussians: Gaussians, coefficients: Tensor) -> Gaussians:
-    """Multiply albedos by the light that falls on each Gaussian's third axis, its outward normal."""
-    shade = torch.exp(quadratic_basis(third_axis(gaussians.quats)) @ coefficients)
-    return gaussians._replace(colors=gaussians.colors * shade)
+def light(gaussians: Gaussians, clip: Tensor, shade: Tensor) -> Gaussians:
+    """Multiply albedos [N, 3] by the light on each Gaussian's third axis, its outward normal in camera space.
+
+    Args:
+        gaussians: quats [B, N, 4].
+        clip: [8, 3] coefficients of `quadratic_basis` for the whole clip.
+        shade: [B, 4] a constant and a slope for each frame.
+
+    Returns:
+        The Gaussians with colours [B, N, 3].
+    """
+    normals = third_axis(gaussians.quats)
+    shaded = shade[:, None, :1] + normals @ shade[:, 1:, None]
+    return gaussians._replace(colors=gaussians.colors * torch.exp(quadratic_basis(normals) @ clip + shaded))
 
 
 def third_axis(quats: Tensor) -> Tensor:

@@ -37,6 +37,7 @@ class HandPlayback:
     bones: Tensor  # [T, 16, 4, 4] of the canonical (right) hand, mirrored camera for a left hand
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
+    shade: Tensor  # [T, 4] see `lighting.light`
     # The same poses in that side's own MANO convention: x_cam = MANO(global_orient, hand_pose, betas) + transl
     # about the rest wrist joint; a left hand's model is the mirrored right one.
     global_orient_aa: Tensor  # [T, 3]
@@ -56,6 +57,7 @@ class ObjectPlayback:
     verts: Tensor  # [V, 3] own frame, metres at the initial size
     faces: Tensor  # [F, 3]
     splats: CanonicalObject
+    shade: Tensor  # [T, 4]
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Playback:
     width: int
     height: int
     normalize_shift: tuple[float, float, float]  # of the clip's file; places HOLD's scaled space
-    light: Tensor | None  # [8, 3] coefficients of `lighting.light`
+    light: Tensor | None  # [8, 3] the clip's light (see `lighting.light`); None: colours are fixed
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
 
@@ -82,20 +84,21 @@ class Playback:
     def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
         """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours."""
         index = torch.as_tensor(list(frames))
-        whole = concatenate(
+        return concatenate(
             self._posed(entity, index) for entity in (self.entities if entities is None else entities)
         )
-        return whole if self.light is None else light(whole, self.light)
 
     def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
+        subject = self.object if entity == "object" else self.hands[entity]
         if entity == "object":
-            obj = self.object
-            return pose_object(obj.splats, ObjectFrames(obj.rotations[index], obj.centers[index], obj.scale))
-        hand = self.hands[entity]
-        points = hand.splats.points
-        if hand.splats.posedirs is not None:
-            points = points + pose_corrective(hand.splats.posedirs, hand.hand_pose[index])
-        return skin_hand(hand.splats, points, hand.bones[index], entity)
+            frames = ObjectFrames(subject.rotations[index], subject.centers[index], subject.scale)
+            posed = pose_object(subject.splats, frames)
+        else:
+            points = subject.splats.points
+            if subject.splats.posedirs is not None:
+                points = points + pose_corrective(subject.splats.posedirs, subject.hand_pose[index])
+            posed = skin_hand(subject.splats, points, subject.bones[index], entity)
+        return posed if self.light is None else light(posed, self.light, subject.shade[index])
 
     def trajectory(self) -> HandObjectTrajectory:
         """Meshes and joints of every frame, camera space, metres."""
@@ -122,6 +125,9 @@ def record(
     frames = torch.arange(scene.n_frames)
     canonical = scene.canonical(scene.entities)
     hands: dict[Side, HandPlayback] = {}
+    shade = {entity: torch.zeros(scene.n_frames, 4) for entity in scene.entities}
+    if scene.lighting is not None:
+        shade |= {entity: value.detach() for entity, value in scene.lighting.shade.items()}
     for side in scene.sides:
         model, betas = scene.hand_model(side), scene.hand_betas(side)
         pose = scene.hand_frames(side, frames)
@@ -144,6 +150,7 @@ def record(
             splats._replace(
                 points=splats.points + splats.shapedirs @ betas, shapedirs=splats.shapedirs[..., :0]
             ),
+            shade[side],
             orient,
             fingers,
             transl,
@@ -155,7 +162,13 @@ def record(
         pose = scene.object_frames(frames)
         surface = scene.object_surface
         obj = ObjectPlayback(
-            pose.rotations, pose.centers, pose.scale, surface.verts, surface.faces, canonical["object"]
+            pose.rotations,
+            pose.centers,
+            pose.scale,
+            surface.verts,
+            surface.faces,
+            canonical["object"],
+            shade["object"],
         )
     return Playback(
         name,
@@ -164,7 +177,7 @@ def record(
         scene.width,
         scene.height,
         tuple(map(float, normalize_shift)),
-        None if scene.lighting is None else scene.lighting.coefficients.detach(),
+        None if scene.lighting is None else scene.lighting.clip.detach(),
         hands,
         obj,
     )

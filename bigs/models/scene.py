@@ -117,18 +117,11 @@ class Scene(nn.Module):
     def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject, frames: Tensor) -> Gaussians:
         """Gaussians of one entity at `frames` [B], camera space and lit: means [B, N, 3], quats [B, N, 4]."""
         if entity == "object":
-            return self._lit(pose_object(canonical, self.object_frames(frames)))
-        posed = pose_hand(
-            self.hand_model(entity),
-            canonical,
-            self.hand_betas(entity),
-            self.hand_frames(entity, frames),
-            entity,
-        )
-        return self._lit(posed)
-
-    def _lit(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians if self.lighting is None else self.lighting(gaussians)
+            posed = pose_object(canonical, self.object_frames(frames))
+        else:
+            pose = self.hand_frames(entity, frames)
+            posed = pose_hand(self.hand_model(entity), canonical, self.hand_betas(entity), pose, entity)
+        return posed if self.lighting is None else self.lighting(entity, posed, frames)
 
     def hand_points(self, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices [B, V, 3] and 21 joints [B, 21, 3] of a hand in camera space, metres."""

@@ -118,6 +118,8 @@ def build_scene(
             ),
             "object_distance": DistanceField(grid),
         }
+    n_frames = len(clip)
+    present = [*clip.hands, *(["object"] if clip.object is not None else [])]
     return Scene(
         K=torch.as_tensor(clip.K, dtype=torch.float32),
         width=clip.width,
@@ -128,7 +130,7 @@ def build_scene(
             side: HandPoses(start.global_orient, start.hand_pose, start.wrist)
             for side, start in starts.items()
         },
-        lighting=Lighting() if lighting else None,
+        lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
 

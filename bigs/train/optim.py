@@ -11,13 +11,15 @@ from torch import nn
 from bigs.checks import InputError
 from bigs.models.scene import Scene
 
+_LIGHT = {"light": "clip", "shade": "shade"}
 # Group name -> where its parameters are, below a hand's or the object's modules.
 _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
 _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
     *(f"hand.{name}" for name in (*_HAND_FIELD, "betas", "orient", "pose", "pose_bias", "ray", "depth")),
     *(f"object.{name}" for name in (*_OBJECT_FIELD, "orient", "ray", "depth", "scale")),
-    "scene.lighting",
+    "scene.light",
+    "scene.shade",
 )
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in _HAND_FIELD),
@@ -35,7 +37,7 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
         raise InputError(f"stage lrs: expected groups out of {', '.join(GROUPS)}, found {group!r}")
     subject, name = group.split(".")
     if subject == "scene":
-        owners = [] if scene.lighting is None else [scene.lighting]
+        owners = [] if scene.lighting is None else [getattr(scene.lighting, _LIGHT[name])]
     elif subject == "hand":
         if name in _HAND_FIELD:
             owners = [

@@ -249,6 +249,12 @@ def object_prior(step: Step) -> Tensor:
     return squared_norm(step.scene.object_poses.orient) if step.has_object else torch.zeros(())
 
 
+def shade_prior(step: Step) -> Tensor:
+    """Squared shade of every frame: what one light for the clip explains is not for shade to explain."""
+    lighting = step.scene.lighting
+    return _mean([] if lighting is None else (squared_norm(shade) for shade in lighting.shade.values()))
+
+
 def rigid(step: Step) -> Tensor:
     """A hand that holds the object moves with it: its joints stay where they are in the object's frame."""
     if not step.has_object:
@@ -314,6 +320,7 @@ TERMS: dict[str, Callable[[Step], Tensor]] = {
     "pose_prior": pose_prior,
     "betas_prior": betas_prior,
     "object_prior": object_prior,
+    "shade_prior": shade_prior,
     "rigid": rigid,
     "contact": contact,
     "penetration": penetrating,
