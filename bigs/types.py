@@ -54,7 +54,9 @@ class HandObjectTrajectory:
 
     name: str  # sequence name
     frame_names: tuple[str, ...]  # T names, as the clip lists them
-    joints: dict[Side, np.ndarray]  # [T, 21, 3]: 16 in MANO order, then tips of thumb, index, middle, ring, pinky
+    joints: dict[
+        Side, np.ndarray
+    ]  # [T, 21, 3]: 16 in MANO order, then tips of thumb, index, middle, ring, pinky
     verts: dict[Side, np.ndarray]  # [T, V, 3]
     faces: dict[Side, np.ndarray]  # [F, 3]
     object_verts: np.ndarray | None  # [T, Vo, 3]

@@ -47,20 +47,34 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
     plain = to_plain(config)
     for change in changes:
         path, separator, text = change.partition("=")
-        *parents, last = path.split(".")
+        keys = path.split(".")
+        for open_ended in ("lrs", "weights"):
+            # Groups are named subject.part, so what follows is one key.
+            if open_ended in keys:
+                place = keys.index(open_ended) + 1
+                keys[place:] = [".".join(keys[place:])]
         node = plain
-        for parent in parents:
-            if not isinstance(node, dict) or parent not in node:
-                raise InputError(f"--set {change}: expected a path in the configuration, found no {parent!r}")
-            node = node[parent]
-        open_ended = bool(parents) and parents[-1] in ("lrs", "weights")
-        if not separator or not isinstance(node, dict) or (last not in node and not open_ended):
-            known = f" (there are {', '.join(node)})" if isinstance(node, dict) else ""
-            raise InputError(
-                f"--set {change}: expected path=value with a known path, found no {last!r}{known}"
-            )
-        node[last] = yaml.safe_load(text)
+        for depth, key in enumerate(keys):
+            is_last = depth == len(keys) - 1
+            may_be_new = is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
+            if not separator or not isinstance(node, dict) or not (key in node or may_be_new):
+                known = f"; there are {', '.join(node)}" if isinstance(node, dict) else ""
+                raise InputError(f"--set {change}: expected path=value, found no setting {key!r}{known}")
+            if not is_last:
+                node = node[key]
+        node[keys[-1]] = _scalar(text)
     return from_plain(plain, "--set")
+
+
+def _scalar(text: str) -> Any:
+    """A value as YAML reads it, except that 1e-3 is a number, too."""
+    value = yaml.safe_load(text)
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    return value
 
 
 def save_config(path: Path, config: RunConfig, extra: dict[str, Any]) -> None:

@@ -51,7 +51,7 @@ _CONTACT = replace(
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
-    steps=100,
+    steps=80,
     lrs={
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
@@ -68,35 +68,40 @@ _APPEARANCE = OptimizeStage(
     frames_per_step=6,
 )
 
+# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once.
 _JOINT = OptimizeStage(
     name="joint",
     step="interacting-subjects",
-    steps=100,
+    steps=250,
     lrs={
-        "hand.orient": 0.002,
-        "hand.pose": 0.002,
-        "hand.ray": 0.0005,
-        "hand.depth": 0.001,
-        "hand.triplane": 5e-3,
-        "hand.appearance": 1e-3,
+        "hand.orient": 0.005,
+        "hand.pose": 0.01,
+        "hand.ray": 0.0015,
+        "hand.depth": 0.003,
+        "hand.triplane": 1e-2,
+        "hand.appearance": 2e-3,
+        "hand.geometry": 1e-3,
         "hand.color": 2e-3,
-        "object.triplane": 5e-3,
-        "object.appearance": 1e-3,
-        "object.geometry": 5e-4,
-        "object.orient": 0.002,
-        "object.ray": 0.0005,
+        "object.triplane": 1e-2,
+        "object.appearance": 2e-3,
+        "object.geometry": 1e-3,
+        "object.orient": 0.005,
+        "object.ray": 0.0015,
         "scene.light": 5e-3,
         "scene.shade": 5e-3,
     },
     weights={
-        "image": 1.0,
-        "ssim": 0.2,
+        "image": 4.0,
+        "ssim": 0.8,
         "mask": 0.5,
-        "shade_prior": 0.02,
         "labels": 0.5,
-        "silhouette": 0.5,
+        "silhouette": 4.0,
         "scale": 100.0,
+        "lbs": 1000.0,
+        "shade_prior": 0.02,
         **_POSE_PRIORS,
+        # Colours now say what the prior had to say before.
+        "pose_prior": 0.2,
         "rigid": 0.03,
         "contact": 0.1,
         "penetration": 0.01,
@@ -109,4 +114,100 @@ _JOINT = OptimizeStage(
 
 FAST = RunConfig(stages=(_HANDS_COARSE, _HANDS_FINE, _APPEARANCE, ScaleSearchStage(), _CONTACT, _JOINT))
 
-PRESETS: dict[str, RunConfig] = {"fast": FAST}
+# More steps and finer images for whoever can wait a quarter of an hour.
+FULL = replace(
+    FAST,
+    hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
+    object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
+    stages=(
+        replace(_HANDS_COARSE, steps=100),
+        replace(_HANDS_FINE, steps=200, image_size=160),
+        replace(_APPEARANCE, steps=200),
+        ScaleSearchStage(),
+        replace(_CONTACT, steps=100, image_size=160),
+        replace(_JOINT, steps=700),
+        replace(
+            _JOINT,
+            name="joint-fine",
+            steps=300,
+            lrs={name: 0.3 * lr for name, lr in _JOINT.lrs.items()},
+            image_size=480,
+            frames_per_step=4,
+        ),
+    ),
+)
+
+# Seconds, for tests: every kind of stage, hardly any steps.
+SMOKE = replace(
+    FAST,
+    hand=replace(FAST.hand, subdivisions=0, triplane=TriplaneConfig(features=4, resolution=32)),
+    object=replace(FAST.object, n_gaussians=600, triplane=TriplaneConfig(features=4, resolution=32)),
+    initial=InitialConfig(surface_resolution=40),
+    stages=(
+        replace(_HANDS_COARSE, steps=25),
+        replace(_HANDS_FINE, steps=10, image_size=80),
+        replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
+        ScaleSearchStage(candidates=15),
+        replace(_CONTACT, steps=8, image_size=80),
+        replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
+    ),
+)
+
+# The paper as written: Eq. 4-6 alone for each subject, then Eq. 9 with Eq. 8, one frame a step at full size,
+# the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. The terms
+# that need weights of other networks (L_vgg, L_SDS) are not in it.
+_PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "color": 0.1, "scale": 100.0, "mask": 10.0}
+PAPER = RunConfig(
+    initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
+    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3),
+    object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000),
+    lighting=False,
+    contact="center",
+    stages=(
+        OptimizeStage(
+            name="hands",
+            step="single-subject",
+            steps=15_000,
+            lrs={
+                "hand.triplane": 1e-3,
+                "hand.appearance": 1e-3,
+                "hand.geometry": 1e-3,
+                "hand.skinning": 1e-4,
+                "hand.orient": 1e-4,
+                "hand.pose": 1e-4,
+                "hand.ray": 1e-4,
+                "hand.depth": 1e-4,
+            },
+            weights={**_PAPER_IMAGE, "smooth": 1.0, "lbs": 1000.0},
+            frames_per_step=1,
+            final_lr=1.0,
+        ),
+        OptimizeStage(
+            name="object",
+            step="single-subject",
+            steps=30_000,
+            lrs={
+                "object.triplane": 1e-3,
+                "object.appearance": 1e-3,
+                "object.geometry": 1e-3,
+                "object.orient": 1e-4,
+                "object.ray": 1e-4,
+                "object.depth": 1e-4,
+            },
+            weights=_PAPER_IMAGE,
+            frames_per_step=1,
+            final_lr=1.0,
+        ),
+        OptimizeStage(
+            name="translations",
+            step="interacting-subjects",
+            steps=30_000,
+            lrs={"hand.ray": 2e-3, "hand.depth": 2e-3},
+            weights={"image": 1.0, "ssim": 0.2, "mask": 10.0, "contact": 1.0},
+            frames_per_step=1,
+            final_lr=0.01,
+        ),
+    ),
+)
+
+PRESETS: dict[str, RunConfig] = {"smoke": SMOKE, "fast": FAST, "full": FULL, "paper": PAPER}
