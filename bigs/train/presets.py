@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from bigs.fields.triplane import TriplaneConfig
+from bigs.models.hand_splats import HandSplatsConfig
+from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage
+from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
 _POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.005}
