@@ -19,7 +19,7 @@ def check_shape(name: str, array: Any, shape: Sequence[int | str | None]) -> Non
     Args:
         name: what to call the array in the message; include the file when there is one.
         array: anything with a `shape`.
-        shape: one entry per axis: an int must match, a string or None matches any length and is shown by name.
+        shape: one entry per axis: an int must match, a string or None matches any length and is shown.
     """
     found = tuple(array.shape)
     matches = len(found) == len(shape) and all(

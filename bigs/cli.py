@@ -1,4 +1,4 @@
-"""The command line: `bigs demo`, `info`, `reconstruct`, `eval`, `render`, `export`. Only this file prints or exits."""
+"""The command line: demo, info, reconstruct, eval, render, export. Only this file prints or exits."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
 
     Args:
         run: the run folder.
-        format: ply (3D Gaussians), poses (npz), challenge (.pt), mesh (the object), or hand-meshes (each frame).
+        format: ply (Gaussians), poses (npz), challenge (.pt), mesh (object), or hand-meshes (every frame).
         out: where to write; the run folder if not given.
     """
     from bigs.commands.run_folder import load_run, write_format

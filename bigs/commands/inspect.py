@@ -23,20 +23,24 @@ def describe_clip(path: Path) -> list[tuple[str, str]]:
         ("camera", f"fx {K[0, 0]:.1f}, fy {K[1, 1]:.1f}, cx {K[0, 2]:.1f}, cy {K[1, 2]:.1f} pixels"),
     ]
     for entity, areas in clip.mask_areas.items():
-        track = clip.object if entity == "object" else clip.hands.get(entity)
-        if track is None:
+        valid = clip.object.valid if entity == "object" and clip.object else None
+        if entity in clip.hands:
+            valid = clip.hands[entity].valid
+        if valid is None:
             rows.append((entity, "absent"))
             continue
         shown = areas > 0
         share = 100.0 * areas[shown].mean() / (clip.width * clip.height) if shown.any() else 0.0
-        text = f"visible in {int(shown.sum())} frames, {share:.1f} % of the image, estimated in {int(track.valid.sum())}"
-        if entity == "object":
-            text += f", {len(track.points)} points"
+        text = f"visible in {int(shown.sum())} frames, {share:.1f} % of the image, "
+        text += f"estimated in {int(valid.sum())}"
+        if entity == "object" and clip.object:
+            text += f", {len(clip.object.points)} points"
         rows.append((entity, text))
-    depths = [
-        (clip.cam_from_world[:, :3, :3] @ track.transl[..., None])[:, 2, 0] + clip.cam_from_world[:, 2, 3]
-        for track in (*clip.hands.values(), *([clip.object] if clip.object else []))
-    ]
+    positions = [hand.transl for hand in clip.hands.values()]
+    if clip.object is not None:
+        positions.append(clip.object.points_world().mean(axis=1))
+    to_cam = clip.cam_from_world
+    depths = [np.einsum("tj,tj->t", to_cam[:, 2, :3], position) + to_cam[:, 2, 3] for position in positions]
     middle = np.median(np.concatenate(depths))
     rows.append(("distance", f"{middle:.2f} m, where a pixel covers {1e3 * middle / K[0, 0]:.1f} mm"))
     return rows

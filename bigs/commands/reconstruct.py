@@ -112,7 +112,7 @@ def reconstruct(
         scene, report = fit(
             clip, hand_models, config, checkpoints=out / CHECKPOINTS, resume=resume, listen=log_and_listen
         )
-        playback = record(scene, clip.name, clip.frame_names, tuple(map(float, clip.normalize_shift)))
+        playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
         listen({"event": "note", "stage": "outputs", "text": "writing results"})
         write_outputs(out, playback)
         result = _score(clip, playback, truth)
@@ -146,7 +146,7 @@ def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -
 
 
 def _image_rows(scores: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
-    """Rows for what only a rendering has, in the shape of `comparison_table`'s: name, unit, scores, change."""
+    """Rows for what only a rendering has, in the shape of `comparison_table`'s."""
     labels = {
         "psnr_foreground": ("PSNR of the foreground", "dB"),
         "ssim_foreground": ("SSIM of the foreground", ""),

@@ -14,7 +14,7 @@ from bigs.export.mesh import save_mesh
 from bigs.export.ply import save_splats
 from bigs.export.poses import ClipPoses, HandPoses, ObjectPoses, save_poses
 from bigs.models.playback import Playback, load_playback, save_playback
-from bigs.types import SIDES, Gaussians
+from bigs.types import Entity, Gaussians
 
 CHECKPOINTS = "checkpoints"
 CONFIG = "config.yaml"
@@ -47,7 +47,7 @@ def write_outputs(run: Path, playback: Playback) -> None:
 
 
 def write_format(folder: Path, playback: Playback, name: str) -> list[Path]:
-    """Write one of `FORMATS` below `folder`; returns the files. A format that needs an absent entity has none."""
+    """Write one of `FORMATS` below `folder`; returns the files: none for an absent entity."""
     writers = {
         "ply": _write_splats,
         "poses": _write_poses,
@@ -65,16 +65,15 @@ def _ready(path: Path) -> Path:
 
 
 def _write_splats(folder: Path, playback: Playback) -> Iterable[Path]:
-    if playback.hands:
-        # One canonical hand serves both sides; without sharing, the right one is written.
-        side = next(side for side in SIDES if side in playback.hands)
-        hand = playback.hands[side].splats
-        yield _save(
-            folder, "hand", Gaussians(hand.points, hand.quats, hand.scales, hand.opacities, hand.colors)
-        )
-    if playback.object is not None:
-        obj = playback.object.splats
-        yield _save(folder, "object", Gaussians(obj.means, obj.quats, obj.scales, obj.opacities, obj.colors))
+    names: dict[Entity, str] = {"right": "hand", "left": "hand", "object": "object"}
+    if not playback.shares_hand:
+        names["left"] = "hand_left"
+    for entity, name in names.items():
+        # One canonical hand that serves both sides is written once.
+        if entity in playback.entities and not (
+            entity == "left" and "right" in playback.hands and playback.shares_hand
+        ):
+            yield _save(folder, name, playback.canonical(entity))
 
 
 def _save(folder: Path, name: str, gaussians: Gaussians) -> Path:

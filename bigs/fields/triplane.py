@@ -46,6 +46,8 @@ class Triplane(nn.Module):
     queries metres in a box of +-1, where a hand touches 25 of 256 texels an axis.)
     """
 
+    bounds: Tensor  # [2, 3] in the units of the points
+
     def __init__(self, config: TriplaneConfig, bounds: Tensor) -> None:
         super().__init__()
         self.planes = nn.Parameter(

@@ -11,6 +11,9 @@ from bigs.geometry.surface import DistanceGrid
 class DistanceField(nn.Module):
     """Trilinear samples of a `DistanceGrid`; beyond the grid, the distance to its box is added."""
 
+    values: Tensor  # [1, 1, Z, Y, X] metres
+    bounds: Tensor  # [2, 3] metres
+
     def __init__(self, grid: DistanceGrid) -> None:
         super().__init__()
         values = torch.as_tensor(grid.values, dtype=torch.float32)

@@ -55,7 +55,7 @@ def point_spacing(points: np.ndarray, neighbours: int = 4) -> np.ndarray:
 
 
 def frames_from_normals(normals: np.ndarray) -> np.ndarray:
-    """Rotations [N, 3, 3] whose third column is the unit normal [N, 3]; the other two are arbitrary tangents."""
+    """Rotations [N, 3, 3] whose third column is the unit normal [N, 3]; the others are any tangents."""
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     tangent = np.cross(helper, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)

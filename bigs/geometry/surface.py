@@ -114,7 +114,7 @@ class VisualHull:
 
 
 def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
-    """Distance [N] of points to the convex hull of `cloud` [M, 3]: the largest over its faces; negative inside."""
+    """Distance [N] of points to the convex hull of `cloud` [M, 3], along its faces; negative inside."""
     largest = np.full(len(points), -np.inf)
     for equation in scipy.spatial.ConvexHull(cloud).equations:
         np.maximum(largest, points @ equation[:3] + equation[3], out=largest)
@@ -122,7 +122,7 @@ def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
 
 
 def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12) -> np.ndarray:
-    """Normals [N, 3] of a point cloud by local planes, turned to agree with the directions `outward` [N, 3]."""
+    """Normals [N, 3] of a point cloud by local planes, turned towards the directions `outward` [N, 3]."""
     _, index = scipy.spatial.cKDTree(points).query(points, k=min(neighbours, len(points)))
     patches = points[index] - points[index].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))

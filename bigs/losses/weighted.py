@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 
@@ -13,4 +14,4 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     Raises:
         KeyError: a term has no weight. (A weight whose term was never computed is the stage's error.)
     """
-    return sum(weights[name] * term for name, term in terms.items())
+    return torch.stack([weights[name] * term for name, term in terms.items()]).sum()

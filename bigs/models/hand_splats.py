@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,8 @@ from bigs.types import Gaussians, Side
 class HandSplatsConfig:
     """How the hand is covered with Gaussians and how its field is built."""
 
-    triplane: TriplaneConfig = TriplaneConfig(features=16, resolution=128)
-    decoders: DecoderConfig = DecoderConfig()
+    triplane: TriplaneConfig = field(default_factory=lambda: TriplaneConfig(features=16, resolution=128))
+    decoders: DecoderConfig = field(default_factory=DecoderConfig)
     # Midpoint subdivisions of the template's mesh. The released code uses three (49k Gaussians); an image in
     # which the hand is 100 pixels long cannot show more than one.
     subdivisions: int = 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,8 @@ from bigs.types import Gaussians
 class ObjectSplatsConfig:
     """How the object is covered with Gaussians and how its field is built."""
 
-    triplane: TriplaneConfig = TriplaneConfig(features=16, resolution=128)
-    decoders: DecoderConfig = DecoderConfig()
+    triplane: TriplaneConfig = field(default_factory=lambda: TriplaneConfig(features=16, resolution=128))
+    decoders: DecoderConfig = field(default_factory=DecoderConfig)
     # Gaussians at the start, spread evenly over the initial surface; the paper starts from at least 10000.
     n_gaussians: int = 6000
     scale_per_spacing: float = 0.6

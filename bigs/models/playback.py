@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -38,7 +39,7 @@ class HandPlayback:
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
     shade: Tensor  # [T, 4] see `lighting.light`
-    # The same poses in that side's own MANO convention: x_cam = MANO(global_orient, hand_pose, betas) + transl
+    # The same poses in that side's own MANO convention, x_cam = MANO(orient, pose, betas) + transl
     # about the rest wrist joint; a left hand's model is the mirrored right one.
     global_orient_aa: Tensor  # [T, 3]
     hand_pose_aa: Tensor  # [T, 15, 3] relative to the model's mean pose
@@ -69,7 +70,7 @@ class Playback:
     K: Tensor  # [3, 3]
     width: int
     height: int
-    normalize_shift: tuple[float, float, float]  # of the clip's file; places HOLD's scaled space
+    normalize_shift: tuple[float, ...]  # [3] of the clip's file; places HOLD's scaled space
     light: Tensor | None  # [8, 3] the clip's light (see `lighting.light`); None: colours are fixed
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
@@ -80,6 +81,20 @@ class Playback:
 
     def __len__(self) -> int:
         return len(self.frame_names)
+
+    @property
+    def shares_hand(self) -> bool:
+        """Whether both sides, if there are both, show the same canonical Gaussians."""
+        points = [hand.splats.points for hand in self.hands.values()]
+        return len(points) < 2 or torch.equal(points[0], points[1])
+
+    def canonical(self, entity: Entity) -> Gaussians:
+        """An entity's Gaussians [N, ...] before posing: a hand's in its shaped rest pose (right-handed)."""
+        if entity == "object":
+            splats = self.object.splats
+            return Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.colors)
+        splats = self.hands[entity].splats
+        return Gaussians(splats.points, splats.quats, splats.scales, splats.opacities, splats.colors)
 
     def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
         """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours."""
@@ -119,7 +134,7 @@ class Playback:
 
 @torch.no_grad()
 def record(
-    scene: Scene, name: str, frame_names: tuple[str, ...], normalize_shift: tuple[float, float, float]
+    scene: Scene, name: str, frame_names: tuple[str, ...], normalize_shift: Sequence[float] | np.ndarray
 ) -> Playback:
     """Evaluate a scene once and keep what is needed to show it."""
     frames = torch.arange(scene.n_frames)

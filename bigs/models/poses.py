@@ -15,7 +15,7 @@ from bigs.geometry.rotations import axis_angle_to_matrix
 
 
 class HandFrames(NamedTuple):
-    """Poses of one hand at B frames, in the canonical (right) hand's coordinates of a mirrored or plain camera."""
+    """Poses of one hand at B frames, as poses of the canonical (right) hand."""
 
     global_orient: Tensor  # [B, 3, 3]
     hand_pose: Tensor  # [B, 15, 3, 3]
@@ -50,7 +50,7 @@ class RayPositions(nn.Module):
 
 
 class HandPoses(nn.Module):
-    """One hand's poses over a clip. A left hand's are stored mirrored, as poses of the canonical right hand."""
+    """One hand's poses over a clip; a left hand's rotations are stored mirrored."""
 
     def __init__(self, global_orient: Tensor, hand_pose: Tensor, wrist: Tensor) -> None:
         """Starts: rotations [T, 3, 3] and [T, 15, 3, 3], wrist joint positions [T, 3] in metres."""

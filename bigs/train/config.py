@@ -31,7 +31,7 @@ class OptimizeStage:
     frames_per_step: int = 0
     # Learning rates fall along a cosine to this share.
     final_lr: float = 0.1
-    # Stop when the smoothed loss has not fallen by `stop_gain` (relative) within `stop_patience` steps; 0: never.
+    # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
     stop_patience: int = 0
     stop_gain: float = 0.002
 

@@ -100,7 +100,7 @@ def _trust(valid: np.ndarray, transl: Tensor, config: InitialConfig) -> Tensor:
 
 
 def smooth_hand(start: HandStart, sigma: float) -> HandStart:
-    """Robustly smoothed rotations and position; the position as a ray and a log depth, whose noises differ."""
+    """Robustly smoothed rotations and position; ray and log depth apart, since their noises differ."""
     pose = torch.stack(
         [smooth_rotations(start.hand_pose[:, j], start.trust, sigma) for j in range(15)], dim=1
     )

@@ -1,4 +1,4 @@
-"""Presets: ready configurations as values. `fast` and `full` go beyond the paper, `paper` is the paper's plan."""
+"""Presets: configurations as values. `fast` and `full` go beyond the paper, `paper` is the paper's plan."""
 
 from __future__ import annotations
 

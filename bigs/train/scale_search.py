@@ -1,4 +1,4 @@
-"""The object's size from contact: the one size at which hands that touch it in the image touch it in space."""
+"""The object's size from contact: at which size do hands that touch it in the image touch it in space?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loss terms by name. Each asks a `Step` for what it needs; a rendering is made once, when first asked for."""
+"""The loss terms by name. Each asks a `Step` for what it needs; a rendering is made when first asked for."""
 
 from __future__ import annotations
 
