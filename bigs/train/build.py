@@ -10,6 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.surface import (
@@ -38,6 +39,39 @@ from bigs.train.initial import (
 )
 from bigs.types import MASK_VALUES, Side
 
+# Fewer points than this carry no surface.
+_MIN_POINTS = 30
+
+
+def usable_silhouettes(clip: Clip, start: ObjectStart) -> list[int]:
+    """Frames whose silhouette may carve the object: it is visible, and its pose was measured.
+
+    An interpolated pose carves what it should not; such frames serve only when there are hardly any others.
+    """
+    shown = [t for t in range(len(clip)) if clip.mask_areas["object"][t] > 0]
+    trusted = [t for t in shown if start.trust[t] == 1.0]
+    return trusted if len(trusted) >= min(len(shown), 5) else shown
+
+
+def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
+    """The fallback: the convex hull of the points.
+
+    Raises:
+        InputError: the points span no volume.
+    """
+    size = (start.points.max(0) - start.points.min(0)).max()
+    grid = empty_grid(
+        start.points.min(0) - 0.1 * size, start.points.max(0) + 0.1 * size, config.surface_resolution
+    )
+    try:
+        distance = convex_distance(grid.points(), start.points)
+    except scipy.spatial.QhullError:
+        raise InputError(
+            "entities.object: pts.cano: expected points that span a volume, "
+            f"found {len(start.points)} in a plane or fewer than four"
+        ) from None
+    return DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
+
 
 def object_surface(
     clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialConfig
@@ -45,11 +79,16 @@ def object_surface(
     """The object's surface: visual hull of the masks blended with the points' planes.
 
     `unknown` [T, H, W] (bool) marks unlabelled occluders.
+
+    Raises:
+        ValueError: masks and poses leave nothing of the object, or too few points to tell.
     """
+    usable = usable_silhouettes(clip, start)
+    if not usable:
+        raise ValueError("no frame shows the object")
     size = (start.points.max(0) - start.points.min(0)).max()
     lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
     grid = empty_grid(lower, upper, config.surface_resolution)
-    usable = [t for t in range(len(clip)) if clip.mask_areas["object"][t] > 0]
     labels = np.stack([clip.mask(t) for t in usable])
     # Whatever is not background may hide the object, so the object may be there.
     hull = VisualHull(
@@ -66,6 +105,8 @@ def object_surface(
     corners = grid.points()
     distance = hull.distance(corners, stop=config.surface_reach)
     points = start.points[hull.distance(start.points) < 0.25 * config.surface_reach]
+    if len(points) < _MIN_POINTS:
+        raise ValueError(f"only {len(points)} of {len(start.points)} points lie inside the silhouettes")
     # Beyond the points' convex hull only what nearly always shows as object stays: the far side of an object
     # that was never turned does, the space that a hand always covers does not.
     doubtful = np.flatnonzero(distance < config.surface_reach)
@@ -87,8 +128,8 @@ def build_scene(
     hand: HandSplatsConfig,
     obj: ObjectSplatsConfig,
     lighting: bool,
-) -> Scene:
-    """A scene at its start values.
+) -> tuple[Scene, list[str]]:
+    """A scene at its start values, and what had to be replaced by something simpler on the way.
 
     Args:
         clip: the loaded clip.
@@ -104,11 +145,17 @@ def build_scene(
         for side, track in clip.hands.items()
     }
     canonical = _canonical_hands(clip, hand_models, hand)
+    notes: list[str] = []
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
-        grid = object_surface(clip, unknown, start, initial)
-        verts, faces = extract_mesh(grid)
+        try:
+            grid = object_surface(clip, unknown, start, initial)
+            verts, faces = extract_mesh(grid)
+        except (ValueError, scipy.spatial.QhullError) as reason:
+            notes.append(f"object surface from masks: {reason}; the points' convex hull stands in for it")
+            grid = convex_surface(start, initial)
+            verts, faces = extract_mesh(grid)
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
         object_parts = {
             "object_splats": ObjectSplats(points, normals, _nearest_colors(points, start), obj),
@@ -120,7 +167,7 @@ def build_scene(
         }
     n_frames = len(clip)
     present = [*clip.hands, *(["object"] if clip.object is not None else [])]
-    return Scene(
+    scene = Scene(
         K=torch.as_tensor(clip.K, dtype=torch.float32),
         width=clip.width,
         height=clip.height,
@@ -133,6 +180,7 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
+    return scene, notes
 
 
 def _canonical_hands(

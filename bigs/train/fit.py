@@ -41,7 +41,6 @@ class FitReport:
 
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
-    notes: list[str] = field(default_factory=list)
 
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
@@ -75,9 +74,10 @@ def fit(
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene = build_scene(
+    scene, notes = build_scene(
         clip, unknown, hand_models, config.initial, config.hand, config.object, config.lighting
     )
+    report.skipped += notes
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
