@@ -1,10 +1,10 @@
 """Pose the built-in hand and render both hands from one set of Gaussians.
 
 Key ideas:
-- The built-in hand needs no file. `load_hand_models(DIR)` reads MANO-format files instead; nothing else changes.
+- The built-in hand needs no file. `load_hand_models(DIR)` reads MANO-format files; nothing else changes.
 - A hand is posed by rotations: 15 finger joints relative to their parents, one for the wrist.
-- There is one canonical hand, the right one. The left hand is its mirror image, so the same Gaussians and the same
-  poses show a pair of hands that close together.
+- There is one canonical hand, the right one. The left hand is its mirror image, so the same Gaussians and
+  the same poses show a pair of hands that close together.
 
 Writes `hands.png` (four stages of a fist) and `right_fist.ply` (the posed mesh, metres).
 
@@ -22,7 +22,6 @@ import tyro
 from torch import Tensor
 
 from bigs.export.mesh import save_mesh
-from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel, load_hand_models
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig, pose_hand
 from bigs.models.lighting import light
@@ -60,7 +59,7 @@ def main(
     betas = torch.zeros(10)
 
     with torch.no_grad():
-        # The fields are fresh, so they reproduce the template; a trained `HandSplats` is used in the same way.
+        # The fields are fresh, so they reproduce the template; trained ones are used in the same way.
         canonical = HandSplats(right, HandSplatsConfig())()
         pair = concatenate(pose_hand(right, canonical, betas, frames, side) for side in ("right", "left"))
         lit = light(pair, from_above(), torch.zeros(len(stages), 4))
@@ -84,8 +83,9 @@ def fist(model: HandModel, amount: Tensor) -> Tensor:
     In MANO's axes the fingers point to -x and the palm to -y, so a finger bends about +z.
     """
     bend = torch.zeros(len(amount), 15, 3)
-    bend[:, :12, 2] = math.radians(70) * amount[:, None]  # index, middle, pinky, ring
-    bend[:, 12:, 1] = math.radians(20) * amount[:, None]  # the thumb lies across them
+    bend[:, :12, 2] = math.radians(75) * amount[:, None]  # index, middle, pinky, ring
+    bend[:, 12, 0] = math.radians(45) * amount  # the thumb turns in front of the palm
+    bend[:, 13:, :2] = math.radians(30) * amount[:, None, None] * torch.tensor([0.8, -0.6])
     return model.pose_matrices(bend - model.hands_mean)
 
 

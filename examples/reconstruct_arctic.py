@@ -1,7 +1,7 @@
 """Reconstruct a clip of the ARCTIC challenge and write its submission file.
 
 Key ideas:
-- A clip is a HOLD / HANDS-challenge `build` folder: images, label masks and `data.npy` with initial estimates.
+- A clip is a HOLD / HANDS-challenge `build` folder: images, label masks, and initial estimates in `data.npy`.
 - A run is one call with a configuration that is a plain value; presets are such values.
 - `arctic_preds/<sequence>.pt` is the challenge's file. It can be read back and scored without the run.
 
@@ -35,7 +35,7 @@ def main(
     hand_model: Path | None = None,
     gt: Path | None = None,
     preset: Literal["smoke", "fast", "full", "paper"] = "smoke",
-    frames: int = 12,
+    frames: int = 24,
 ) -> Path:
     """Reconstruct a clip, check the submission file, and score it where the truth is known.
 
