@@ -1,0 +1,217 @@
+"""Visual hull, points and marching cubes on a ball whose silhouettes are known exactly."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from bigs.geometry.surface import (
+    DistanceGrid,
+    VisualHull,
+    blend_with_points,
+    convex_distance,
+    empty_grid,
+    extract_mesh,
+    inlier_points,
+    point_normals,
+    silhouette_distance,
+)
+
+RADIUS, DISTANCE = 0.05, 0.5
+MIDDLE = np.array([0.02, -0.01, 0.015])  # of the ball in the object's frame
+K = np.array([[300.0, 0, 95.0], [0, 300.0, 85.0], [0, 0, 1]])
+SIZE = (170, 190)
+PIXEL = DISTANCE / K[0, 0]  # metres per pixel at the ball
+
+
+def even_directions(count: int) -> np.ndarray:
+    """Points [count, 3] spread evenly on the unit sphere."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=-1)
+
+
+def looking_along(direction: np.ndarray) -> np.ndarray:
+    """A rotation whose third row is `direction`."""
+    side = np.cross(direction, [0.3, 0.9, -0.2])
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(direction, side), direction])
+
+
+def ball_mask(middle_cam: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] whose centre's ray hits a ball at `middle_cam`."""
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones(SIZE)], axis=-1)
+    along = rays @ middle_cam / np.linalg.norm(rays, axis=-1)
+    return middle_cam @ middle_cam - along**2 < RADIUS**2
+
+
+@pytest.fixture(scope="module")
+def masks_and_hull() -> tuple[np.ndarray, VisualHull]:
+    rotations = np.stack([looking_along(d) for d in even_directions(40)])
+    centers = np.tile([0.01, -0.02, DISTANCE], (40, 1))
+    masks = np.stack([ball_mask(r @ MIDDLE + c) for r, c in zip(rotations, centers, strict=True)])
+    silhouettes = np.stack([silhouette_distance(mask) for mask in masks])
+    return masks, VisualHull(silhouettes, K, rotations, centers)
+
+
+@pytest.fixture(scope="module")
+def hull(masks_and_hull) -> VisualHull:
+    return masks_and_hull[1]
+
+
+def ball_grid(resolution: int = 40) -> DistanceGrid:
+    grid = empty_grid(MIDDLE - 0.07, MIDDLE + np.array([0.07, 0.08, 0.09]), resolution)
+    values = np.linalg.norm(grid.points() - MIDDLE, axis=-1) - RADIUS
+    return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)
+
+
+def test_grid_covers_its_box_with_cubes() -> None:
+    lower, upper = np.array([0.0, 1.0, 2.0]), np.array([0.4, 1.2, 2.3])
+    grid = empty_grid(lower, upper, 8)
+    assert grid.spacing == pytest.approx(0.05)
+    points = grid.points().reshape(*grid.values.shape, 3)
+    np.testing.assert_array_equal(points[0, 0, 0], lower)
+    assert (points[-1, -1, -1] >= upper - 1e-9).all()
+    assert (points[-1, -1, -1] < upper + 1.01 * grid.spacing).all()
+    np.testing.assert_allclose(points[3, 1, 2], lower + 0.05 * np.array([3, 1, 2]))
+
+
+def test_silhouette_distance_counts_from_the_border_between_pixels() -> None:
+    allowed = np.zeros((5, 9), dtype=bool)
+    allowed[:, :4] = True
+    expected = np.arange(9) - 3.5
+    np.testing.assert_allclose(silhouette_distance(allowed), np.tile(expected, (5, 1)))
+    assert (silhouette_distance(np.ones((5, 9), dtype=bool)) <= -9).all()
+
+
+def test_hull_of_a_ball_has_its_radius(hull: VisualHull) -> None:
+    directions = even_directions(300)
+    on_surface = hull.distance(MIDDLE + RADIUS * directions)
+    # A hull contains its object; from 40 views it is hardly larger.
+    assert on_surface.max() < PIXEL
+    grid = empty_grid(MIDDLE - 0.07, MIDDLE + 0.07, 40)
+    verts, _ = extract_mesh(
+        DistanceGrid(hull.distance(grid.points()).reshape(grid.values.shape), grid.origin, grid.spacing)
+    )
+    radii = np.linalg.norm(verts - MIDDLE, axis=1)
+    assert radii.min() > RADIUS - PIXEL and radii.max() < 1.12 * RADIUS
+    assert radii.mean() == pytest.approx(RADIUS, abs=0.6 * PIXEL)
+    np.testing.assert_allclose(
+        hull.distance(MIDDLE + 1.5 * RADIUS * directions), 0.5 * RADIUS, atol=2 * PIXEL
+    )
+
+
+def test_hull_distance_grows_outwards(hull: VisualHull) -> None:
+    directions = even_directions(60)
+    outward = hull.outward(MIDDLE + RADIUS * directions, 0.5 * PIXEL)
+    cosine = (outward * directions).sum(-1) / np.linalg.norm(outward, axis=-1)
+    assert cosine.min() > 0.5 and cosine.mean() > 0.9
+
+
+def test_hull_stops_only_where_it_may(hull: VisualHull) -> None:
+    points = MIDDLE + 0.1 * np.random.default_rng(0).uniform(-1, 1, (400, 3))
+    full, stopped = hull.distance(points), hull.distance(points, stop=0.01)
+    near = full <= 0.01
+    assert near.any() and not near.all()
+    np.testing.assert_array_equal(stopped[near], full[near])
+    assert (stopped[~near] > 0.01).all()
+
+
+def test_points_that_no_frame_sees_count_as_inside() -> None:
+    silhouette = silhouette_distance(ball_mask(np.array([0.0, 0.0, DISTANCE])))
+    one = VisualHull(silhouette[None], K, np.eye(3)[None], np.array([[0.0, 0.0, DISTANCE]]))
+    behind, aside, outside = one.distance(np.array([[0.0, 0, -1.0], [0.9, 0, 0], [0.09, 0, 0]]))
+    assert behind == aside == -1.0
+    assert outside == pytest.approx(0.04, abs=PIXEL)
+
+
+def test_share_seen_counts_frames(masks_and_hull) -> None:
+    masks, hull = masks_and_hull
+    inside, outside = MIDDLE, MIDDLE + np.array([0.0, 0.0, 0.11])
+    points = np.stack([inside, outside])
+    some = masks.copy()
+    some[10:] = False
+    np.testing.assert_allclose(hull.share_seen(points, masks)[0], 1.0)
+    np.testing.assert_allclose(hull.share_seen(points, some), [0.25, hull.share_seen(points, some)[1]])
+    assert hull.share_seen(points, masks)[1] < 0.5
+    behind_some = hull.share_seen(MIDDLE + 0.7 * even_directions(8), np.ones_like(masks))
+    assert (behind_some < 0.5).all()
+
+
+def test_points_carve_a_hollow_that_silhouettes_cannot_show() -> None:
+    grid = ball_grid()
+    # A flat bottom 3 cm below the ball's pole, seen as points.
+    side = np.linspace(-0.015, 0.015, 13)
+    x, y = np.meshgrid(side, side)
+    bottom = MIDDLE + np.stack([x.ravel(), y.ravel(), np.full(x.size, RADIUS - 0.03)], axis=-1)
+    normals = np.tile([0.0, 0.0, 1.0], (len(bottom), 1))
+    blended = blend_with_points(grid, bottom, normals, reach=0.05)
+
+    def nearest_corner(z: float) -> int:
+        return np.linalg.norm(grid.points() - MIDDLE - np.array([0.0, 0.0, z]), axis=-1).argmin()
+
+    def at(z: float) -> float:
+        return blended.values.ravel()[nearest_corner(z)]
+
+    assert grid.values.ravel()[nearest_corner(0.03)] < 0
+    assert at(0.03) > 0  # above the bottom, inside the ball: now empty
+    assert at(0.01) < 0  # below it: still solid
+    assert (blended.values >= grid.values).all()
+    far = np.linalg.norm(grid.points()[:, None] - bottom, axis=-1).min(axis=1) > 0.0501
+    np.testing.assert_array_equal(blended.values.ravel()[far], grid.values.ravel()[far])
+    np.testing.assert_array_equal(ball_grid().values, grid.values)  # the old grid is left alone
+
+
+def test_mesh_of_a_ball_is_closed_and_looks_outwards() -> None:
+    verts, faces = extract_mesh(ball_grid())
+    mesh = trimesh.Trimesh(verts, faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)
+    np.testing.assert_allclose(np.linalg.norm(verts - MIDDLE, axis=1), RADIUS, atol=1e-4)
+
+
+def test_mesh_is_closed_where_the_solid_meets_the_grids_border() -> None:
+    grid = empty_grid(np.zeros(3), np.ones(3), 8)
+    full = DistanceGrid(np.full(grid.values.shape, -0.1), grid.origin, grid.spacing)
+    mesh = trimesh.Trimesh(*extract_mesh(full), process=False)
+    assert mesh.is_watertight and 1.0 < mesh.volume < (1 + 2 / 8) ** 3
+
+
+def test_mesh_is_the_largest_piece_alone() -> None:
+    grid = empty_grid(np.zeros(3), np.array([1.0, 0.5, 0.5]), 40)
+    points = grid.points()
+    large = np.linalg.norm(points - [0.25, 0.25, 0.25], axis=-1) - 0.2
+    small = np.linalg.norm(points - [0.8, 0.25, 0.25], axis=-1) - 0.1
+    both = DistanceGrid(np.minimum(large, small).reshape(grid.values.shape), grid.origin, grid.spacing)
+    verts, faces = extract_mesh(both)
+    np.testing.assert_allclose(np.linalg.norm(verts - 0.25, axis=1), 0.2, atol=2e-3)
+    assert set(np.unique(faces)) == set(range(len(verts)))
+
+
+def test_an_empty_grid_has_no_mesh() -> None:
+    grid = empty_grid(np.zeros(3), np.ones(3), 4)
+    with pytest.raises(ValueError, match="level"):
+        extract_mesh(DistanceGrid(np.ones(grid.values.shape), grid.origin, grid.spacing))
+
+
+def test_convex_distance_of_a_cube() -> None:
+    cube = np.array(np.meshgrid([0.0, 1], [0.0, 1], [0.0, 1])).reshape(3, -1).T
+    points = np.array([[0.5, 0.5, 0.5], [0.9, 0.5, 0.5], [1.0, 0.2, 0.3], [0.5, 0.5, 3.0]])
+    np.testing.assert_allclose(convex_distance(points, cube), [-0.5, -0.1, 0.0, 2.0], atol=1e-12)
+
+
+def test_point_normals_follow_the_surface_and_the_given_side() -> None:
+    directions = even_directions(500)
+    # Only the side is taken from the given directions: these are 60 degrees off.
+    tilted = directions + 1.7 * np.cross(directions, [0.0, 0.6, 0.8])
+    normals = point_normals(RADIUS * directions, tilted)
+    assert (normals * directions).sum(-1).min() > 0.99
+    np.testing.assert_allclose(point_normals(RADIUS * directions, -tilted), -normals)
+
+
+def test_stray_points_are_not_inliers() -> None:
+    cloud = np.concatenate([RADIUS * even_directions(300), [[0.2, 0.0, 0.0], [0.0, -0.3, 0.1]]])
+    keep = inlier_points(cloud)
+    assert keep[:300].all() and not keep[300:].any()
+    assert inlier_points(cloud[-5:]).all()
