@@ -1,0 +1,296 @@
+"""The loop: which frames, what moves, when it stops, and what it says when the loss breaks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from toy_scenes import cube_scene
+
+from bigs.checks import InputError
+from bigs.hand import HandModel
+from bigs.models.hand_splats import silhouette_hand
+from bigs.models.scene import Scene
+from bigs.raster import RasterSettings
+from bigs.train.config import OptimizeStage
+from bigs.train.loop import StageProgress, StageState, choose_frames, run_stage, stage_entities
+from bigs.train.optim import GROUPS, group_parameters
+from bigs.train.targets import Targets
+from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence
+from bigs.types import Side
+
+FRAMES = 3
+
+ALONE = OptimizeStage(
+    name="alone",
+    step="single-subject",
+    steps=3,
+    lrs={"hand.ray": 1e-3, "hand.color": 1e-3, "object.triplane": 1e-2, "object.appearance": 1e-2},
+    weights={"image": 1.0, "coverage": 0.5, "silhouette": 1.0},
+    frames_per_step=2,
+)
+TOGETHER = replace(ALONE, name="together", step="interacting-subjects", weights={"image": 1.0, "labels": 1.0})
+
+
+@pytest.fixture
+def scene(both_hands: dict[Side, HandModel]) -> Scene:
+    torch.manual_seed(0)
+    return cube_scene(both_hands, frames=FRAMES)
+
+
+@pytest.fixture
+def evidence(scene: Scene) -> Evidence:
+    generator = torch.Generator().manual_seed(1)
+    height, width = 30, 40
+    owner = torch.randint(0, 4, (FRAMES, height, width), generator=generator)
+    K = scene.K.clone()
+    K[:2] *= 0.5
+    targets = Targets(
+        torch.rand(FRAMES, height, width, 3, generator=generator),
+        {entity: (owner == i).float() for i, entity in enumerate(("right", "left", "object"))},
+        torch.zeros(FRAMES, height, width),
+        K,
+        width,
+        height,
+    )
+    touching = {side: torch.ones(FRAMES) for side in ("right", "left")}
+    outlines = {side: silhouette_hand(scene.hand_model(side), 0.003, 0.004) for side in scene.sides}
+    return Evidence(targets, touching, outlines, "surface", RasterSettings())
+
+
+def values(scene: Scene) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in scene.named_parameters()}
+
+
+# --- frames ---
+
+
+@pytest.mark.parametrize(("n_frames", "count"), [(12, 3), (12, 5), (7, 2), (7, 6), (5, 1), (30, 7)])
+def test_every_pass_visits_every_frame(n_frames: int, count: int) -> None:
+    stage = replace(ALONE, frames_per_step=count)
+    per_pass = -(-n_frames // count)
+    orders = []
+    for first in range(0, 4 * per_pass, per_pass):
+        batches = [
+            choose_frames(n_frames, stage, 3, step).tolist() for step in range(first, first + per_pass)
+        ]
+        for batch in batches:
+            assert len(set(batch)) == count
+            assert batch == sorted(batch)
+        visits = Counter(frame for batch in batches for frame in batch)
+        assert set(visits) == set(range(n_frames))
+        assert max(visits.values()) <= 2
+        assert sum(visits.values()) == per_pass * count
+        orders.append(batches)
+    assert len({str(batches) for batches in orders}) > 1  # passes are shuffled anew
+
+
+def test_frames_are_a_function_of_seed_and_step() -> None:
+    stage = replace(ALONE, frames_per_step=4)
+    first = [choose_frames(20, stage, 7, step).tolist() for step in range(15)]
+    torch.manual_seed(99)  # the global generator has no say
+    again = [choose_frames(20, stage, 7, step).tolist() for step in reversed(range(15))][::-1]
+    assert first == again
+    assert first != [choose_frames(20, stage, 8, step).tolist() for step in range(15)]
+
+
+@pytest.mark.parametrize("count", [0, 9, 40])
+def test_a_step_may_take_the_whole_clip(count: int) -> None:
+    assert choose_frames(9, replace(ALONE, frames_per_step=count), 0, 5).tolist() == list(range(9))
+
+
+# --- what moves ---
+
+
+@pytest.mark.parametrize("stage", [ALONE, TOGETHER], ids=lambda stage: stage.name)
+def test_listed_groups_change_and_others_do_not(
+    scene: Scene, evidence: Evidence, stage: OptimizeStage
+) -> None:
+    before = values(scene)
+    listed = {id(p) for group in stage.lrs for p in group_parameters(scene, group)}
+    run_stage(scene, stage, evidence, 0)
+    changed = {name for name, p in scene.named_parameters() if not torch.equal(p, before[name])}
+    expected = {name for name, p in scene.named_parameters() if id(p) in listed}
+    assert changed <= expected
+    # Every listed group has moved; decoders move from their last layer on.
+    for group in stage.lrs:
+        assert {
+            n for n, p in scene.named_parameters() if any(p is q for q in group_parameters(scene, group))
+        } & (changed), group
+
+
+@pytest.mark.parametrize(
+    "group", [g for g in GROUPS if g not in ("hand.skinning", "object.depth", "object.scale")]
+)
+def test_every_group_can_be_reached_by_some_term(scene: Scene, evidence: Evidence, group: str) -> None:
+    """A group whose rate does nothing would be a knob without a wire."""
+    stage = replace(
+        TOGETHER, steps=2, lrs={group: 1e-2}, weights={"image": 1.0, "silhouette": 1.0, "rigid": 1.0}
+    )
+    if group.startswith("scene"):
+        stage = replace(stage, lrs={group: 1e-2, "hand.color": 1e-3})
+    # A fresh decoder's last layer is zero, so what lies below it gets a gradient from the second step on.
+    if group.endswith("triplane"):
+        stage = replace(stage, lrs={group: 1e-2, group.replace("triplane", "appearance"): 1e-2})
+    before = values(scene)
+    run_stage(scene, stage, evidence, 0)
+    mine = [n for n, p in scene.named_parameters() if any(p is q for q in group_parameters(scene, group))]
+    assert any(not torch.equal(dict(scene.named_parameters())[name], before[name]) for name in mine)
+
+
+def test_skinning_and_scale_are_reached_too(scene: Scene, evidence: Evidence) -> None:
+    with torch.no_grad():  # bent fingers, so that weights matter
+        for poses in scene.hand_poses.values():
+            poses.pose.fill_(0.3)
+    lrs = {"hand.skinning": 1e-2, "object.scale": 1e-2, "object.depth": 1e-2}
+    stage = replace(TOGETHER, steps=1, lrs=lrs, weights={"image": 1.0, "rigid": 1.0, "contact": 1.0})
+    before = values(scene)
+    run_stage(scene, stage, evidence, 0)
+    changed = {name for name, p in scene.named_parameters() if not torch.equal(p, before[name])}
+    assert "object_poses.log_scale" in changed
+    assert "object_poses.position.log_depth" in changed
+    assert any("skinning" in name for name in changed)
+
+
+def test_alone_only_what_moves_is_rendered(scene: Scene) -> None:
+    assert stage_entities(scene, ALONE) == ("right", "left", "object")
+    assert stage_entities(scene, replace(ALONE, lrs={"hand.ray": 1.0})) == ("right", "left")
+    assert stage_entities(scene, replace(ALONE, lrs={"object.ray": 1.0})) == ("object",)
+    assert stage_entities(scene, replace(TOGETHER, lrs={"hand.ray": 1.0})) == ("right", "left", "object")
+
+
+# --- how often fields are evaluated ---
+
+
+def count_calls(scene: Scene) -> Counter[str]:
+    calls: Counter[str] = Counter()
+
+    def counter(name: str) -> Any:
+        return lambda module, inputs: calls.update([name])
+
+    scene.hand_splats["right"].register_forward_pre_hook(counter("hand"))
+    scene.object_splats.register_forward_pre_hook(counter("object"))
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("lrs", "weights", "expected"),
+    [
+        ({"hand.ray": 1e-3}, {"image": 1.0}, {"hand": 1, "object": 1}),
+        ({"hand.ray": 1e-3, "hand.color": 1e-3}, {"image": 1.0}, {"hand": 5, "object": 1}),
+        ({"hand.ray": 1e-3, "object.geometry": 1e-3}, {"labels": 1.0}, {"hand": 1, "object": 5}),
+        ({"hand.ray": 1e-3}, {"silhouette": 1.0, "rigid": 1.0}, {}),
+    ],
+)
+def test_frozen_fields_are_evaluated_once(
+    scene: Scene,
+    evidence: Evidence,
+    lrs: dict[str, float],
+    weights: dict[str, float],
+    expected: dict[str, int],
+) -> None:
+    """Two hands and several frames share one evaluation of a field that moves."""
+    calls = count_calls(scene)
+    run_stage(scene, replace(TOGETHER, steps=5, lrs=lrs, weights=weights), evidence, 0)
+    assert calls == expected
+
+
+# --- stopping ---
+
+
+def steps_run(scene: Scene, evidence: Evidence, stage: OptimizeStage) -> StageState:
+    return run_stage(scene, stage, evidence, 0)
+
+
+def test_all_steps_without_a_stopping_rule(scene: Scene, evidence: Evidence) -> None:
+    state = steps_run(scene, evidence, replace(ALONE, steps=12, lrs={"hand.ray": 1e-9}))
+    assert state.step == 12
+
+
+def test_stops_when_the_loss_has_settled(scene: Scene, evidence: Evidence) -> None:
+    still = replace(TOGETHER, steps=40, lrs={"hand.ray": 1e-9}, weights={"silhouette": 1.0}, stop_patience=5)
+    still = replace(still, frames_per_step=0)
+    state = steps_run(scene, evidence, still)
+    # The first step is the best; then five without a gain, and the next is not taken.
+    assert state.step == 6
+    assert steps_run(scene, evidence, replace(still, stop_patience=0)).step == 40
+
+
+def test_goes_on_while_the_loss_falls(scene: Scene, evidence: Evidence) -> None:
+    with torch.no_grad():
+        for poses in scene.hand_poses.values():
+            poses.pose.fill_(0.5)
+    falling = replace(
+        TOGETHER,
+        steps=25,
+        lrs={"hand.pose": 1e-2},
+        weights={"pose_prior": 1.0},
+        frames_per_step=0,
+        stop_patience=2,
+    )
+    assert steps_run(scene, evidence, falling).step == 25
+
+
+# --- what a hook sees ---
+
+
+def test_the_hook_sees_every_step(scene: Scene, evidence: Evidence) -> None:
+    seen: list[StageProgress] = []
+    final = run_stage(scene, ALONE, evidence, 0, after_step=lambda progress, state: seen.append(progress))
+    assert [progress.step for progress in seen] == [1, 2, 3]
+    assert final.step == 3
+    for progress in seen:
+        assert progress.steps == ALONE.steps
+        assert progress.terms.keys() == ALONE.weights.keys()
+        total = sum(ALONE.weights[name] * value for name, value in progress.terms.items())
+        assert progress.loss == pytest.approx(total, rel=1e-5)
+        assert progress.seconds > 0
+
+
+# --- what breaks ---
+
+
+@pytest.mark.parametrize("stage", [ALONE, TOGETHER], ids=lambda stage: stage.name)
+def test_an_unknown_term_is_named(scene: Scene, evidence: Evidence, stage: OptimizeStage) -> None:
+    with pytest.raises(InputError, match=rf"stage {stage.name}: expected terms out of .*found 'imagee'"):
+        run_stage(scene, replace(stage, weights={"imagee": 1.0}), evidence, 0)
+
+
+def test_coverage_belongs_to_the_single_subject_step(scene: Scene, evidence: Evidence) -> None:
+    with pytest.raises(InputError, match="found 'coverage'"):
+        run_stage(scene, replace(TOGETHER, weights={"coverage": 1.0}), evidence, 0)
+
+
+def test_a_loss_that_is_not_finite_names_the_term(scene: Scene, evidence: Evidence) -> None:
+    with torch.no_grad():
+        scene.hand_poses["left"].pose[1, 3, 0] = float("nan")
+    stage = replace(ALONE, lrs={"hand.pose": 1e-3}, weights={"orient_prior": 1.0, "pose_prior": 1.0})
+    with pytest.raises(FloatingPointError, match=r"stage alone, step 0: pose_prior is not finite") as caught:
+        run_stage(scene, stage, evidence, 0)
+    assert "orient_prior" not in str(caught.value)
+
+
+@pytest.mark.parametrize("term", ["image", "silhouette"])
+def test_a_diverged_pose_is_reported_by_stage_and_term(scene: Scene, evidence: Evidence, term: str) -> None:
+    """The user's input was fine: this is no InputError about 'means'."""
+    with torch.no_grad():
+        scene.hand_poses["right"].position.ray[0, 0] = float("nan")
+    stage = replace(ALONE, lrs={"hand.ray": 1e-3}, weights={term: 1.0}, frames_per_step=0)
+    with pytest.raises(FloatingPointError, match=rf"stage alone, step 0: .*{term}"):
+        run_stage(scene, stage, evidence, 0)
+
+
+def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None:
+    """On an ordinary scene, each term alone can be asked for and can be differentiated."""
+    for step, image_terms in IMAGE_TERMS.items():
+        for name in (*image_terms, *TERMS):
+            lrs = {group: 1e-4 for group in GROUPS}
+            stage = replace(ALONE, step=step, steps=1, lrs=lrs, weights={name: 1.0})
+            seen: list[float] = []
+            run_stage(scene, stage, evidence, 0, after_step=lambda p, _, seen=seen: seen.append(p.loss))
+            assert seen[0] >= 0, name
+            assert all(torch.isfinite(p).all() for p in scene.parameters()), name

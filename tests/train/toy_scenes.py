@@ -1,0 +1,71 @@
+"""A scene that is known exactly: a cube held between two flat hands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+import trimesh
+
+from bigs.fields.triplane import TriplaneConfig
+from bigs.geometry.distance import DistanceField
+from bigs.geometry.surface import empty_grid
+from bigs.hand import HandModel, mirror_points
+from bigs.models.hand_splats import HandSplats, HandSplatsConfig
+from bigs.models.lighting import Lighting
+from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
+from bigs.models.poses import HandPoses, ObjectPoses
+from bigs.models.scene import ObjectSurface, Scene
+from bigs.types import Side
+
+HALF = 0.04  # half the true cube's side, metres
+CENTER = (0.01, -0.02, 0.5)
+TINY = TriplaneConfig(features=2, resolution=8)
+
+
+def cube_scene(models: Mapping[Side, HandModel], size: float = 1.0, frames: int = 3) -> Scene:
+    """A cube seen at `size` times its true size (and depth), hands that touch the true cube's two sides.
+
+    The right hand touches the side of larger x with the 30 vertices that reach furthest, the left the other.
+    """
+    half, center = size * HALF, size * torch.tensor(CENTER)
+    grid = empty_grid(np.full(3, -2 * half), np.full(3, 2 * half), 48)
+    corners = np.abs(grid.points()) - half
+    # Exact distance of a box: outside its corners' excess, inside the nearest side.
+    distance = np.linalg.norm(corners.clip(0), axis=1) + corners.max(axis=1).clip(max=0)
+    grid = type(grid)(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
+    cube = trimesh.creation.box((2 * half,) * 3)
+    points, face = trimesh.sample.sample_surface_even(cube, 200, seed=0)
+
+    still = torch.eye(3).repeat(frames, 1, 1)
+    right = models["right"]
+    config = HandSplatsConfig(triplane=TINY, subdivisions=0)
+    fingers = torch.eye(3).repeat(frames, 15, 1, 1)
+    rest = right(torch.zeros(10), fingers[:1], still[:1], torch.zeros(1, 3)).vertices[0]
+    reach = rest[:, 0].topk(30, largest=False).values.mean()
+    inward = rest[rest[:, 0].topk(30, largest=False).indices].mean(0)
+    # The touching part lies on the middle of the side.
+    wrist = torch.tensor(CENTER) + torch.stack([HALF - reach, -inward[1], -inward[2]])
+    mirrored = torch.tensor(CENTER) + mirror_points(wrist - torch.tensor(CENTER))
+    wrists = {"right": wrist.expand(frames, 3), "left": mirrored.expand(frames, 3)}
+    return Scene(
+        K=torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]]),
+        width=80,
+        height=60,
+        hand_splats={"right": HandSplats(right, config)},
+        betas={"right": torch.zeros(10)},
+        hand_poses={side: HandPoses(still, fingers, wrists[side]) for side in ("right", "left")},
+        object_splats=ObjectSplats(
+            np.asarray(points),
+            np.asarray(cube.face_normals[face]),
+            np.full((len(points), 3), 0.5),
+            ObjectSplatsConfig(triplane=TINY),
+        ),
+        object_poses=ObjectPoses(still, center.expand(frames, 3)),
+        object_surface=ObjectSurface(
+            torch.as_tensor(cube.vertices, dtype=torch.float32), torch.as_tensor(np.array(cube.faces))
+        ),
+        object_distance=DistanceField(grid),
+        lighting=Lighting(("right", "left", "object"), frames),
+    )
