@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
+from command_line import Answer, Run, run_bigs
 
+from bigs.cli import main
 from bigs.data.base import Clip
 from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
@@ -22,27 +22,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
-
-
-class Run(NamedTuple):
-    """A finished `bigs reconstruct`, as a user sees it."""
-
-    folder: Path
-    command: list[str]  # all arguments but --out
-    stdout: str
-    stderr: str
-    code: int
-
-
-def run_bigs(*arguments: str | Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    """The command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "bigs.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
 
 
 @pytest.fixture(scope="session")
@@ -69,5 +48,20 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_clip: Path) -> R
     """`bigs reconstruct` of the tiny clip with the smoke preset. Read it, never write into it."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
-    done = run_bigs(*command, "--out", folder)
-    return Run(folder, command, done.stdout, done.stderr, done.returncode)
+    return Run(folder, command, run_bigs(*command, "--out", folder))
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
+    """Calls the command line in this process and returns its exit code and what it wrote."""
+
+    def run(*arguments: str | Path) -> Answer:
+        capsys.readouterr()
+        code = 0
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as leave:
+            code = leave.code if isinstance(leave.code, int) else 1
+        return Answer(code, *capsys.readouterr())
+
+    return run

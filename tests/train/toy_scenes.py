@@ -48,7 +48,7 @@ def cube_scene(models: Mapping[Side, HandModel], size: float = 1.0, frames: int 
     # The touching part lies on the middle of the side.
     wrist = torch.tensor(CENTER) + torch.stack([HALF - reach, -inward[1], -inward[2]])
     mirrored = torch.tensor(CENTER) + mirror_points(wrist - torch.tensor(CENTER))
-    wrists = {"right": wrist.expand(frames, 3), "left": mirrored.expand(frames, 3)}
+    wrists = {"right": wrist.repeat(frames, 1), "left": mirrored.repeat(frames, 1)}
     return Scene(
         K=torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]]),
         width=80,
@@ -62,7 +62,7 @@ def cube_scene(models: Mapping[Side, HandModel], size: float = 1.0, frames: int 
             np.full((len(points), 3), 0.5),
             ObjectSplatsConfig(triplane=TINY),
         ),
-        object_poses=ObjectPoses(still, center.expand(frames, 3)),
+        object_poses=ObjectPoses(still, center.repeat(frames, 1)),
         object_surface=ObjectSurface(
             torch.as_tensor(cube.vertices, dtype=torch.float32), torch.as_tensor(np.array(cube.faces))
         ),

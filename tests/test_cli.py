@@ -1,0 +1,118 @@
+"""The command line: help, arguments and settings. A refusal is one sentence and leaves nothing behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import Answer, assert_refused, run_bigs
+
+from bigs.checks import InputError
+
+
+@pytest.mark.parametrize("command", ["", "demo", "info", "reconstruct", "eval", "render", "export"])
+def test_help(call: Callable[..., Answer], command: str) -> None:
+    answer = call(*command.split(), "--help")
+    assert answer.code == 0
+    assert answer.err == ""
+    assert "usage: bigs" in answer.out
+    text = " ".join(answer.out.replace("│", " ").split())
+    expected = {
+        "demo": "Make a little clip of two hands",
+        "reconstruct": "change one setting, as path=value",
+        "render": "transforms.json",
+        "export": "hand-meshes",
+        "eval": "gt.npz",
+        "info": "HANDS-challenge build folder",
+    }
+    for word in [expected[command]] if command else expected:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("reconstruct CLIP --out OUT --bogus 3", ["--bogus"]),
+        ("reconstruct CLIP --out OUT --preset turbo", ["turbo", "--preset", "smoke"]),
+        ("reconstruct CLIP", ["--out"]),
+        ("reconstruct CLIP --out OUT --threads two", ["--threads"]),
+        ("reconstruct CLIP --out OUT --threads -1", ["--threads", "expected 0", "found -1"]),
+        ("frobnicate", ["frobnicate"]),
+        ("", ["demo"]),
+        ("export RUN --format fbx", ["fbx", "--format", "ply"]),
+    ],
+)
+def test_arguments_that_are_none(
+    call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path, arguments: str, words: list[str]
+) -> None:
+    places = {"CLIP": tiny_clip, "OUT": tmp_path / "out", "RUN": tmp_path}
+    answer = call(*(places.get(argument, argument) for argument in arguments.split()))
+    assert_refused(answer)
+    assert all(word in answer.err for word in words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("seed", ["--set seed", "expected path=value"]),
+        ("raster.eps2=1", ["--set raster.eps2=1", "no setting 'eps2'", "eps2d"]),
+        ("raster.eps2d=wide", ["--set.raster.eps2d", "expected float", "'wide'"]),
+        ("raster.eps2d=[", ["--set raster.eps2d=["]),
+        ("raster.eps2d=-1", ["eps2d", "expected", "found -1"]),
+        ("raster.tile_size=12", ["tile_size", "expected 4, 8 or 16", "found 12"]),
+        ("stages.joint.weights.typo=1", ["joint", "expected terms out of", "found 'typo'"]),
+        ("stages.joint.lrs.hand.typo=1", ["expected groups out of", "found 'hand.typo'"]),
+        ("stages.joint.image_size=-2", ["image_size", "expected", "found -2"]),
+        ("stages.object-scale-search.candidates=0", ["candidates", "expected", "found 0"]),
+        ("initial.surface_resolution=0", ["surface_resolution", "expected", "found 0"]),
+        ("object.n_gaussians=0", ["n_gaussians", "expected", "found 0"]),
+        ("checkpoint_every=0", ["checkpoint_every", "expected", "found 0"]),
+    ],
+)
+def test_settings_that_cannot_be(
+    call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path, change: str, words: list[str]
+) -> None:
+    """All is checked before anything is written, however late in the plan it would matter."""
+    out = tmp_path / "out"
+    earlier = ("hands-coarse", "hands-fine", "appearance", "contact")
+    quick = [f"--set=stages.{stage}.steps=1" for stage in earlier]
+    answer = call("reconstruct", tiny_clip, "--out", out, "--preset", "smoke", *quick, "--set", change)
+    assert_refused(answer, *words)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (FloatingPointError("stage joint, step 3: image is not finite"), 3, ["joint", "checkpoint is kept"]),
+        (KeyboardInterrupt(), 130, ["interrupted", "--resume"]),
+        (InputError("x: expected [bold]1[/bold], found 2"), 2, ["x: expected [bold]1[/bold], found 2"]),
+        (OSError(28, "No space left", "run/scene.safetensors"), None, ["No space left", "scene.safetensors"]),
+    ],
+)
+def test_other_ends_are_one_line_too(
+    call: Callable[..., Answer],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    error: BaseException,
+    code: int | None,
+    words: list[str],
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr("bigs.commands.run_folder.load_run", fail)
+    answer = call("export", tmp_path, "--format", "ply")
+    assert_refused(answer, *words)
+    assert code is None or answer.code == code
+
+
+@pytest.mark.slow
+def test_a_refusal_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """As a shell sees it: the code, and one line without colour."""
+    answer = run_bigs("reconstruct", tmp_path / "nowhere", "--out", tmp_path / "out")
+    assert_refused(answer, "bigs: ", "nowhere: expected a clip folder")
+    assert "\x1b" not in answer.err

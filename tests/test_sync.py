@@ -1,0 +1,52 @@
+"""Things that are said twice, for speed or for another language, say the same."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import typing
+from importlib.metadata import entry_points, version
+from pathlib import Path
+
+import bigs
+from bigs import cli
+from bigs.commands.run_folder import FORMATS
+from bigs.train.presets import PRESETS
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_command_line_knows_every_preset() -> None:
+    assert typing.get_args(cli.Preset) == tuple(PRESETS)
+
+
+def test_the_command_line_knows_every_format() -> None:
+    assert typing.get_args(cli.Format) == FORMATS
+
+
+def test_one_version() -> None:
+    cargo = tomllib.loads((ROOT / "Cargo.toml").read_text())
+    assert bigs.__version__ == version("bigs") == cargo["workspace"]["package"]["version"]
+
+
+def test_the_console_script_is_main() -> None:
+    (script,) = entry_points(group="console_scripts", name="bigs")
+    assert script.load() is cli.main
+
+
+def test_the_python_version_is_said_once() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    manifest = (ROOT / "rust" / "py" / "Cargo.toml").read_text()
+    minor = re.search(r"abi3-py3(\d+)", manifest)
+    assert minor is not None
+    assert project["requires-python"] == f">=3.{minor[1]}"
+
+
+def test_only_the_command_line_prints_or_exits() -> None:
+    spoken = re.compile(r"^\s*(print\(|sys\.exit\(|exit\(|raise SystemExit)", re.MULTILINE)
+    offenders = [
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "bigs").rglob("*.py")
+        if path.name != "cli.py" and spoken.search(path.read_text())
+    ]
+    assert offenders == []
