@@ -49,6 +49,43 @@ def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
     return (np.where(allowed, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 
+def silhouette_around_points(
+    allowed: np.ndarray, points_cam: np.ndarray, K: np.ndarray, tolerance: float = 0.006
+) -> np.ndarray:
+    """`silhouette_distance` of a mask that does not contradict the object's own points.
+
+    A patch of points well outside `allowed` means that something unlabelled hides the object there; single
+    ones are strays. Where there are such patches, the mask is opened around them.
+
+    Args:
+        allowed: [H, W] bool.
+        points_cam: [N, 3] the object's points in camera space, metres.
+        K: [3, 3].
+        tolerance: metres by which pose errors may put a point outside.
+    """
+    distance = silhouette_distance(allowed)
+    height, width = allowed.shape
+    front = points_cam[points_cam[:, 2] > 1e-3]
+    pixels = np.rint(front[:, :2] / front[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5).astype(int)
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+    if not inside.any():
+        return distance
+    column, row = pixels[inside].T
+    reach = tolerance * K[0, 0] / float(np.median(front[:, 2]))
+    outside = distance[row, column] > reach
+    hits = np.zeros(allowed.shape, dtype=np.float32)
+    np.add.at(hits, (row[outside], column[outside]), 1.0)
+    side = 2 * int(np.ceil(reach)) + 1
+    together = scipy.ndimage.uniform_filter(hits, side, mode="constant") * side * side
+    if together.max() < _PATCH:
+        return distance
+    return silhouette_distance(allowed | (together >= _PATCH))
+
+
+# So many points within reach of one another are no strays.
+_PATCH = 4.0
+
+
 @dataclass(frozen=True)
 class VisualHull:
     """Silhouettes and the poses they were seen from."""
@@ -57,6 +94,8 @@ class VisualHull:
     K: np.ndarray  # [3, 3] intrinsics
     rotations: np.ndarray  # [T, 3, 3]; x_cam = R x + centre
     centers: np.ndarray  # [T, 3] metres
+    # How many frames must agree that a point is outside: one wrong mask or pose then carves nothing.
+    agreeing: int = 1
 
     def distance(self, points: np.ndarray, stop: float = np.inf) -> np.ndarray:
         """Distance of points [N, 3] to the hull: the largest over frames of that to the silhouette's cone.
@@ -70,7 +109,8 @@ class VisualHull:
             sees counts as inside by a large amount.
         """
         height, width = self.silhouettes.shape[1:]
-        largest = np.full(len(points), -np.inf)
+        # The largest distances found so far, descending; the last one counts.
+        largest = np.full((self.agreeing, len(points)), -np.inf)
         active = np.arange(len(points))
         for silhouette, rotation, center in zip(self.silhouettes, self.rotations, self.centers, strict=True):
             cam = points[active] @ rotation.T + center
@@ -80,9 +120,11 @@ class VisualHull:
                 silhouette, np.stack([v[seen], u[seen]]), order=1, prefilter=False
             )
             index = active[seen]
-            largest[index] = np.maximum(largest[index], pixels * cam[seen, 2] / self.K[0, 0])
-            active = active[largest[active] <= stop]
-        return np.where(np.isfinite(largest), largest, -1.0)
+            found = pixels * cam[seen, 2] / self.K[0, 0]
+            for rank in largest:
+                rank[index], found = np.maximum(rank[index], found), np.minimum(rank[index], found)
+            active = active[largest[-1, active] <= stop]
+        return np.where(np.isfinite(largest[-1]), largest[-1], -1.0)
 
     def share_seen(self, points: np.ndarray, masks: np.ndarray) -> np.ndarray:
         """In what share [N] of the frames each point falls on a true pixel of `masks` [T, H, W] (bool)."""

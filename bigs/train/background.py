@@ -16,6 +16,8 @@ from bigs.data.base import Clip
 _THRESHOLD = 0.06
 # Long side in pixels at which frames are compared: occluders are large, and a clip then fits in memory.
 _SIZE = 320
+# Half the width in compared pixels of holes that are closed.
+_CLOSE = 5
 # With more of the background moving than this, the camera moves or the light changes: nothing can be told.
 _USELESS_SHARE = 0.5
 
@@ -42,6 +44,12 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     cross = scipy.ndimage.generate_binary_structure(2, 1)[None]
     unknown = scipy.ndimage.binary_opening(unknown, cross, iterations=1)
     unknown = scipy.ndimage.binary_dilation(unknown, cross, iterations=2) & background
+    # An occluder that happens to have the background's colour here and there has holes, and one pixel's hole
+    # carves a tunnel through the visual hull: what unknown and known pixels enclose is closed.
+    padded = np.pad(unknown | ~background, ((0, 0), (_CLOSE, _CLOSE), (_CLOSE, _CLOSE)), mode="edge")
+    closed = scipy.ndimage.binary_closing(padded, cross, iterations=_CLOSE)[:, _CLOSE:-_CLOSE, _CLOSE:-_CLOSE]
+    near = scipy.ndimage.binary_dilation(unknown, cross, iterations=2 * _CLOSE)
+    unknown |= closed & near & background
     return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
 
 

@@ -21,7 +21,7 @@ from bigs.geometry.surface import (
     empty_grid,
     extract_mesh,
     point_normals,
-    silhouette_distance,
+    silhouette_around_points,
 )
 from bigs.hand import HandModel, shared_betas
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
@@ -90,18 +90,15 @@ def object_surface(
     lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
     grid = empty_grid(lower, upper, config.surface_resolution)
     labels = np.stack([clip.mask(t) for t in usable])
+    rotations, centers = start.rotations[usable].numpy(), start.centers[usable].numpy()
     # Whatever is not background may hide the object, so the object may be there.
-    hull = VisualHull(
-        np.stack(
-            [
-                silhouette_distance((frame != 0) | hiding)
-                for frame, hiding in zip(labels, unknown[usable], strict=True)
-            ]
-        ),
-        clip.K,
-        start.rotations[usable].numpy(),
-        start.centers[usable].numpy(),
-    )
+    allowed = (labels != 0) | unknown[usable]
+    silhouettes = [
+        silhouette_around_points(mask, start.points @ rotation.T + center, clip.K)
+        for mask, rotation, center in zip(allowed, rotations, centers, strict=True)
+    ]
+    agreeing = min(config.surface_agreeing, len(usable))
+    hull = VisualHull(np.stack(silhouettes), clip.K, rotations, centers, agreeing)
     corners = grid.points()
     distance = hull.distance(corners, stop=config.surface_reach)
     points = start.points[hull.distance(start.points) < 0.25 * config.surface_reach]

@@ -32,6 +32,8 @@ class InitialConfig:
     surface_resolution: int = 80
     # Share of a point's plane against the visual hull falls to nothing at this distance, metres.
     surface_reach: float = 0.016
+    # Frames that must agree before a place is carved away: masks and poses have single faults.
+    surface_agreeing: int = 3
     # The surface may leave the points' convex hull by this much, metres, and further only where the masks
     # show object in more than this share of the frames.
     surface_margin: float = 0.002

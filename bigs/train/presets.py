@@ -96,6 +96,7 @@ _JOINT = OptimizeStage(
     },
     weights={
         "image": 4.0,
+        "mse": 30.0,
         "ssim": 0.8,
         "mask": 0.5,
         "labels": 0.5,

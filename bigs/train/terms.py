@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bigs.losses.contact import center_contact, penetration, surface_contact
 from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask
-from bigs.losses.photometric import masked_l1, masked_ssim
+from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.models.hand_splats import CanonicalHand, pose_hand
@@ -127,6 +127,10 @@ def image_alone(step: Step) -> Tensor:
     return _each_alone(step, masked_l1)
 
 
+def mse_alone(step: Step) -> Tensor:
+    return _each_alone(step, masked_mse)
+
+
 def ssim_alone(step: Step) -> Tensor:
     return _each_alone(step, masked_ssim)
 
@@ -148,6 +152,10 @@ def coverage_alone(step: Step) -> Tensor:
 
 def image_together(step: Step) -> Tensor:
     return masked_l1(step.together.colors[..., :3], step.images, step.foreground)
+
+
+def mse_together(step: Step) -> Tensor:
+    return masked_mse(step.together.colors[..., :3], step.images, step.foreground)
 
 
 def ssim_together(step: Step) -> Tensor:
@@ -294,12 +302,14 @@ def penetrating(step: Step) -> Tensor:
 IMAGE_TERMS: dict[str, dict[str, Callable[[Step], Tensor]]] = {
     "single-subject": {
         "image": image_alone,
+        "mse": mse_alone,
         "ssim": ssim_alone,
         "mask": mask_alone,
         "coverage": coverage_alone,
     },
     "interacting-subjects": {
         "image": image_together,
+        "mse": mse_together,
         "ssim": ssim_together,
         "mask": mask_together,
         "labels": labels,
