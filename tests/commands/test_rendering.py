@@ -141,11 +141,10 @@ def test_straight_colors() -> None:
 def test_export(
     call: Callable[..., Answer], finished_run: Run, tiny: Clip, tmp_path: Path, format: str
 ) -> None:
-    answer = call("export", finished_run.folder, "--format", format, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+    answer = call("export", finished_run.folder, "--format", format, "--out", out)
     assert answer.code == 0 and answer.err == ""
-    written = sorted(
-        str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*") if p.is_file()
-    )
+    written = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
     expected = {
         "ply": ["gaussians/hand.ply", "gaussians/object.ply"],
         "poses": ["poses.npz"],
