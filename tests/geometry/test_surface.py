@@ -1,5 +1,7 @@
 """Visual hull, points and marching cubes on a ball whose silhouettes are known exactly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.spatial
@@ -14,6 +16,7 @@ from bigs.geometry.surface import (
     extract_mesh,
     inlier_points,
     point_normals,
+    silhouette_around_points,
     silhouette_distance,
 )
 
@@ -125,6 +128,69 @@ def test_points_that_no_frame_sees_count_as_inside() -> None:
     behind, aside, outside = one.distance(np.array([[0.0, 0, -1.0], [0.9, 0, 0], [0.09, 0, 0]]))
     assert behind == aside == -1.0
     assert outside == pytest.approx(0.04, abs=PIXEL)
+
+
+def test_one_wrong_frame_carves_nothing_when_two_must_agree(hull: VisualHull) -> None:
+    wrong = hull.silhouettes.copy()
+    wrong[7] = silhouette_distance(np.tile(np.arange(SIZE[1]) < 3, (SIZE[0], 1)))
+    points = MIDDLE + 0.8 * RADIUS * even_directions(50)
+    alone = replace(hull, silhouettes=wrong).distance(points)
+    agreed = replace(hull, silhouettes=wrong, agreeing=2).distance(points)
+    assert (alone > 0).all() and (agreed < 0).all()
+
+
+def test_with_agreement_the_second_or_third_largest_distance_counts(hull: VisualHull) -> None:
+    points = MIDDLE + 0.07 * np.random.default_rng(1).uniform(-1, 1, (200, 3))
+    single = [
+        VisualHull(s[None], K, r[None], c[None]).distance(points)
+        for s, r, c in zip(hull.silhouettes, hull.rotations, hull.centers, strict=True)
+    ]
+    ranked = np.sort(single, axis=0)
+    for agreeing in (1, 2, 3):
+        found = replace(hull, agreeing=agreeing).distance(points)
+        np.testing.assert_allclose(found, ranked[-agreeing])
+    two = replace(
+        hull,
+        silhouettes=hull.silhouettes[:2],
+        rotations=hull.rotations[:2],
+        centers=hull.centers[:2],
+        agreeing=3,
+    )
+    assert (two.distance(points) == -1.0).all()
+
+
+def half_allowed() -> np.ndarray:
+    allowed = np.zeros(SIZE, dtype=bool)
+    allowed[:, :90] = True
+    return allowed
+
+
+def at_pixels(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Camera points [N, 3] at the object's distance on pixels' centres."""
+    x = (columns + 0.5 - K[0, 2]) / K[0, 0]
+    y = (rows + 0.5 - K[1, 2]) / K[1, 1]
+    return DISTANCE * np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def test_a_patch_of_points_opens_the_silhouette_around_it() -> None:
+    allowed = half_allowed()
+    columns, rows = (a.ravel().astype(float) for a in np.meshgrid([130, 131, 132], [60, 61, 62]))
+    opened = silhouette_around_points(allowed, at_pixels(columns, rows), K)
+    assert (opened[60:63, 130:133] < 0).all()
+    assert opened[61, 150] > 0 and opened[140, 131] > 0  # elsewhere the mask still speaks
+    np.testing.assert_array_equal(opened[:, :80] < 0, True)
+
+
+def test_strays_small_errors_and_unseen_points_open_nothing() -> None:
+    allowed = half_allowed()
+    plain = silhouette_distance(allowed)
+    strays = at_pixels(np.array([130.0, 20, 160]), np.array([30.0, 80, 140]))
+    # 6 mm are 3.6 pixels here: a patch two pixels outside is within the poses' error.
+    near = at_pixels(np.repeat([90.0, 91.0], 10), np.tile(np.arange(10.0), 2))
+    aside = at_pixels(np.full(9, 900.0), np.arange(9.0))
+    behind = -at_pixels(np.full(9, 130.0), np.arange(9.0))
+    for points in (strays, near, aside, behind, np.concatenate([strays, near, behind])):
+        np.testing.assert_array_equal(silhouette_around_points(allowed, points, K), plain)
 
 
 def test_share_seen_counts_frames(masks_and_hull) -> None:

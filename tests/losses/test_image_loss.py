@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bigs.losses.photometric import masked_l1, masked_ssim
+from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.weighted import weighted_sum
 
@@ -26,6 +26,16 @@ def test_masked_l1_is_the_mean_over_the_mask(mask) -> None:
     pred = target + torch.where(mask[..., None] > 0, 0.0, 0.7)
     assert masked_l1(pred, target, mask) == 0.0
     assert masked_l1(pred, target, torch.zeros_like(mask)) == 0.0
+
+
+def test_masked_mse_is_what_psnr_measures_inside_the_mask(mask) -> None:
+    target = images(2, 16, 16, 3)
+    assert masked_mse(target + 0.5, target, mask).item() == pytest.approx(0.25)
+    assert masked_mse(target + torch.where(mask[..., None] > 0, 0.0, 0.7), target, mask) == 0.0
+    one = target.clone()
+    one[0, 5, 5, 1] += 1.0  # of (48 + 1.5) pixels in each of two images
+    assert masked_mse(one, target, mask).item() == pytest.approx(1.0 / (2 * (8 * 6 + 6 / 4) * 3))
+    assert masked_mse(one, target, torch.zeros_like(mask)) == 0.0
 
 
 def test_masked_ssim_is_zero_for_equal_masked_images_and_grows_with_damage(mask) -> None:
@@ -85,6 +95,7 @@ def test_gradients(mask) -> None:
     target = images(1, 6, 6, 3)
     pred, small = images(1, 6, 6, 3, seed=1).requires_grad_(), mask[:1, 7:13, 2:8]
     assert torch.autograd.gradcheck(lambda p: masked_l1(p, target, small), pred)
+    assert torch.autograd.gradcheck(lambda p: masked_mse(p, target, small), pred)
     assert torch.autograd.gradcheck(lambda p: masked_ssim(p, target, small), pred)
     rows = images(5, 3, seed=2).requires_grad_()
     for loss in (color_spread, scale_size, squared_norm):
