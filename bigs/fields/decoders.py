@@ -2,7 +2,8 @@
 
 Each ends in heads whose last layer starts at zero and whose output is *added* to a start value in the
 head's own space (logits, logarithms, 6-D rotations). A fresh decoder therefore reproduces the start
-exactly, which replaces the released code's 7500-step fit of the network to the same values.
+(skinning weights to 2e-3, for the sake of finite logarithms), which replaces the released code's 7500-step
+fit of the network to the same values.
 """
 
 from __future__ import annotations

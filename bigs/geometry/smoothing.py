@@ -40,7 +40,7 @@ def smooth_vectors(values: Tensor, weights: Tensor, sigma: float) -> Tensor:
     offsets, near = _window(len(values), sigma)
     trust = weights.clone()
     for _ in range(3):
-        fitted = _local_linear(values[near.index], offsets, near.weight * trust[near.index])
+        fitted = _local_linear(values[near.index], offsets, _window_weights(near, trust))
         trust = weights * _tukey((values - fitted).norm(dim=-1), weights)
     return fitted
 
@@ -62,13 +62,17 @@ def smooth_rotations(rotations: Tensor, weights: Tensor, sigma: float) -> Tensor
     windows = rotations[near.index]  # [T, W, 3, 3]
     trust = weights.clone()
     for _ in range(3):
-        window_weights = near.weight * trust[near.index]
-        centre = mean_rotation(windows, window_weights + 1e-12)
+        window_weights = _window_weights(near, trust)
+        centre = mean_rotation(windows, window_weights)
         tangent = matrix_to_axis_angle(centre[:, None].transpose(-1, -2) @ windows)
         fitted = centre @ axis_angle_to_matrix(_local_linear(tangent, offsets, window_weights))
         error = matrix_to_axis_angle(fitted.transpose(-1, -2) @ rotations).norm(dim=-1)
         trust = weights * _tukey(error, weights)
     return fitted
+
+
+# Residuals (metres, radians, or pixels over focal length) below what any estimator can measure.
+_EXACT = 1e-3
 
 
 class _Near:
@@ -88,10 +92,15 @@ def _window(frames: int, sigma: float) -> tuple[Tensor, _Near]:
     return offsets.float(), _Near(index.clamp(0, frames - 1), weight)
 
 
+def _window_weights(near: _Near, trust: Tensor) -> Tensor:
+    """Weights [T, W] of a window's frames; where none is trusted, their nearness alone."""
+    weights = near.weight * trust[near.index]
+    return torch.where(weights.sum(1, keepdim=True) > 1e-6, weights, near.weight)
+
+
 def _local_linear(values: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
     """Value at offset 0 of a weighted line through each window: [T, W, D], [W], [T, W] to [T, D]."""
-    total = weights.sum(1, keepdim=True).clamp_min(1e-12)
-    weights = weights / total
+    weights = weights / weights.sum(1, keepdim=True)
     mean_x = (weights * offsets).sum(1, keepdim=True)
     mean_y = (weights[..., None] * values).sum(1)
     centred = offsets - mean_x
@@ -102,10 +111,12 @@ def _local_linear(values: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
 
 def _tukey(residuals: Tensor, weights: Tensor) -> Tensor:
     """Tukey's biweight of residual norms [T], with a cut-off from their own median."""
-    trusted = residuals[weights > 0]
+    # Interpolated frames fit a line exactly and would pull the median to zero.
+    trusted = residuals[weights > 0.5 * weights.max()]
     if len(trusted) == 0:
         return torch.ones_like(residuals)
     # 1.48 median estimates a standard deviation; 4.685 of those is the usual cut-off. Norms of 3-vectors
     # have a larger median than one coordinate's absolute value, so this errs on the side of keeping frames.
-    cut = 4.685 * 1.48 * trusted.median().clamp_min(1e-9)
+    # A still clip has a median of zero too: nothing within _EXACT is an outlier.
+    cut = 4.685 * 1.48 * trusted.median().clamp_min(_EXACT)
     return (1.0 - (residuals / cut).clamp(max=1.0) ** 2) ** 2

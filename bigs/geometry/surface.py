@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.csgraph
 import scipy.spatial
 import skimage.measure
 
@@ -43,6 +45,8 @@ def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
     """Signed distance in pixels to the border of a mask [H, W]: negative inside `allowed`."""
     if allowed.all():
         return np.full(allowed.shape, -float(max(allowed.shape)), dtype=np.float32)
+    if not allowed.any():
+        return np.full(allowed.shape, float(max(allowed.shape)), dtype=np.float32)
     outside = scipy.ndimage.distance_transform_edt(~allowed)
     inside = scipy.ndimage.distance_transform_edt(allowed)
     # Both count from pixel centres, so the border between two pixels is half a pixel from either.
@@ -77,9 +81,9 @@ def silhouette_around_points(
     np.add.at(hits, (row[outside], column[outside]), 1.0)
     side = 2 * int(np.ceil(reach)) + 1
     together = scipy.ndimage.uniform_filter(hits, side, mode="constant") * side * side
-    if together.max() < _PATCH:
+    if together.max() < _PATCH - 0.5:
         return distance
-    return silhouette_distance(allowed | (together >= _PATCH))
+    return silhouette_distance(allowed | (together >= _PATCH - 0.5))
 
 
 # So many points within reach of one another are no strays.
@@ -105,8 +109,8 @@ class VisualHull:
             stop: points found to be further outside than this are not looked at again.
 
         Returns:
-            [N] metres, negative inside; a lower bound of the true distance outside. A point that no frame
-            sees counts as inside by a large amount.
+            [N] metres, negative inside; a lower bound of the true distance outside. A point that
+            fewer than `agreeing` frames see counts as inside by a large amount.
         """
         height, width = self.silhouettes.shape[1:]
         # The largest distances found so far, descending; the last one counts.

@@ -142,7 +142,7 @@ def record(
     hands: dict[Side, HandPlayback] = {}
     shade = {entity: torch.zeros(scene.n_frames, 4) for entity in scene.entities}
     if scene.lighting is not None:
-        shade |= {entity: value.detach() for entity, value in scene.lighting.shade.items()}
+        shade |= {entity: value.detach().clone() for entity, value in scene.lighting.shade.items()}
     for side in scene.sides:
         model, betas = scene.hand_model(side), scene.hand_betas(side)
         pose = scene.hand_frames(side, frames)
@@ -169,7 +169,7 @@ def record(
             orient,
             fingers,
             transl,
-            betas.detach(),
+            betas.detach().clone(),
             v_posed,
         )
     obj = None
@@ -192,7 +192,7 @@ def record(
         scene.width,
         scene.height,
         tuple(map(float, normalize_shift)),
-        None if scene.lighting is None else scene.lighting.clip.detach(),
+        None if scene.lighting is None else scene.lighting.clip.detach().clone(),
         hands,
         obj,
     )
@@ -240,6 +240,17 @@ def load_playback(path: Path) -> Playback:
         raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: expected format {FORMAT}, found {metadata.get('format')}")
+
+    try:
+        return _assemble(metadata, tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: expected a whole scene file, found one with parts missing ({error})"
+        ) from error
+
+
+def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Playback:
+    """A playback from the contents of its file; whatever is missing raises as it comes."""
 
     def part(prefix: str) -> dict[str, Tensor]:
         return {key.removeprefix(prefix): v for key, v in tensors.items() if key.startswith(prefix)}

@@ -98,3 +98,18 @@ def test_measured_and_very_short_clips_have_no_interpolated_frames() -> None:
     bent = line()
     bent[20, 1] += 1e-4  # one coordinate is enough to be a measurement
     assert (~interpolated_frames(bent)).nonzero()[:, 0].tolist() == [0, 19, 20, 21, T - 1]
+
+
+def test_a_clip_that_is_still_for_most_of_its_length_stays_where_it_is() -> None:
+    """Regression: a median residual of zero once left whole windows without weight, and positions at zero."""
+    still = torch.tensor([[0.1, 0.2, 0.5]]).repeat(40, 1)
+    moving = still[:20] + 0.01 * torch.arange(20.0)[:, None] + 1e-3 * torch.randn(20, 3)
+    values = torch.cat([still, moving])
+    assert (smooth_vectors(values, torch.ones(60), 1.5) - values).norm(dim=-1).max() < 0.03
+
+
+def test_a_gap_wider_than_the_window_is_not_sent_to_zero() -> None:
+    values = torch.tensor([0.1, 0.2, 0.5]) + 0.002 * torch.arange(60.0)[:, None]
+    weights = torch.ones(60)
+    weights[10:25] = 0.0
+    assert (smooth_vectors(values, weights, 1.0) - values).norm(dim=-1).max() < 0.01

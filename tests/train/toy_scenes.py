@@ -55,14 +55,16 @@ def cube_scene(models: Mapping[Side, HandModel], size: float = 1.0, frames: int 
         height=60,
         hand_splats={"right": HandSplats(right, config)},
         betas={"right": torch.zeros(10)},
-        hand_poses={side: HandPoses(still, fingers, wrists[side]) for side in ("right", "left")},
+        hand_poses={
+            side: HandPoses(still.clone(), fingers.clone(), wrists[side]) for side in ("right", "left")
+        },
         object_splats=ObjectSplats(
             np.asarray(points),
             np.asarray(cube.face_normals[face]),
             np.full((len(points), 3), 0.5),
             ObjectSplatsConfig(triplane=TINY),
         ),
-        object_poses=ObjectPoses(still, center.repeat(frames, 1)),
+        object_poses=ObjectPoses(still.clone(), center.repeat(frames, 1)),
         object_surface=ObjectSurface(
             torch.as_tensor(cube.vertices, dtype=torch.float32), torch.as_tensor(np.array(cube.faces))
         ),
