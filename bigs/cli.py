@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
 import os
+import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -134,31 +139,62 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
         _out.print(str(path), markup=False, highlight=False, soft_wrap=True)
 
 
+COMMANDS = {
+    "demo": demo,
+    "info": info,
+    "reconstruct": reconstruct,
+    "eval": evaluate,
+    "render": render,
+    "export": export,
+}
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; the exit code is 0 only on success."""
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            {
-                "demo": demo,
-                "info": info,
-                "reconstruct": reconstruct,
-                "eval": evaluate,
-                "render": render,
-                "export": export,
-            },
-            prog="bigs",
-            description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU.",
-            args=arguments,
-        )
+        _parse(arguments)()
     except InputError as error:
-        _err.print(f"bigs: {error}", markup=False, highlight=False, soft_wrap=True)
-        sys.exit(2)
+        _fail(str(error), 2)
     except FloatingPointError as error:
-        _err.print(f"bigs: {error}; the last checkpoint is kept", markup=False, soft_wrap=True)
-        sys.exit(3)
+        _fail(f"{error}; the last checkpoint is kept", 3)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}expected a file or folder that can be read or written, found: {error.strerror}", 4)
     except KeyboardInterrupt:
-        _err.print("bigs: interrupted; --resume continues from the last checkpoint", soft_wrap=True)
-        sys.exit(130)
+        _fail("interrupted; --resume continues from the last checkpoint", 130)
+
+
+def _parse(arguments: list[str] | None) -> Callable[[], None]:
+    """The command that the arguments ask for, ready to run; unknown options are refused in one line."""
+
+    def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        @functools.wraps(command)
+        def bind(*args: object, **kwargs: object) -> Callable[[], None]:
+            return functools.partial(command, *args, **kwargs)
+
+        return bind
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: deferred(command) for name, command in COMMANDS.items()},
+                prog="bigs",
+                description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU.",
+                args=arguments,
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        # The parser draws a box of several lines; its words are kept, its frame is not.
+        words = " ".join(re.sub(r"[╭╮╰╯│─]+", " ", said.getvalue()).split())
+        _fail(words, 2)
+        raise
+
+
+def _fail(message: str, code: int) -> None:
+    _err.print(f"bigs: {message}", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(code)
 
 
 def _use_threads(threads: int) -> None:

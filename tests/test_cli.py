@@ -90,7 +90,11 @@ def test_settings_that_cannot_be(
         (FloatingPointError("stage joint, step 3: image is not finite"), 3, ["joint", "checkpoint is kept"]),
         (KeyboardInterrupt(), 130, ["interrupted", "--resume"]),
         (InputError("x: expected [bold]1[/bold], found 2"), 2, ["x: expected [bold]1[/bold], found 2"]),
-        (OSError(28, "No space left", "run/scene.safetensors"), None, ["No space left", "scene.safetensors"]),
+        (
+            OSError(28, "No space left", "run/scene.safetensors"),
+            None,
+            ["scene.safetensors", "expected", "found: No space left"],
+        ),
     ],
 )
 def test_other_ends_are_one_line_too(

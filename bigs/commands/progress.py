@@ -32,26 +32,32 @@ def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("start values", total=total, detail="")
-        done = 0.0
+    progress = Progress(*columns, console=console)
+    task = progress.add_task("start values", total=total, detail="")
+    done = 0.0
 
-        def listen(event: dict[str, Any]) -> None:
-            nonlocal done
-            if event["event"] == "stage":
-                place = f"{event['index'] + 1}/{event['stages']}"
-                done = sum(
-                    cost.get(stage.name, 0) * getattr(stage, "steps", 0)
-                    for stage in config.stages[: event["index"]]
-                )
-                progress.update(task, description=f"{place} {event['stage']}", detail="", completed=done)
-            elif event["event"] == "step":
-                progress.update(
-                    task,
-                    completed=done + cost[event["stage"]] * event["step"],
-                    detail=f"step {event['step']}/{event['steps']}, loss {event['loss']:.4f}",
-                )
-            elif event["event"] == "note":
-                progress.console.print(event["text"], highlight=False)
+    def listen(event: dict[str, Any]) -> None:
+        nonlocal done
+        # Not before something happens: bad input is answered by one sentence and nothing else.
+        progress.start()
+        if event["event"] == "stage":
+            place = f"{event['index'] + 1}/{event['stages']}"
+            done = sum(
+                cost.get(stage.name, 0) * getattr(stage, "steps", 0)
+                for stage in config.stages[: event["index"]]
+            )
+            progress.update(task, description=f"{place} {event['stage']}", detail="", completed=done)
+        elif event["event"] == "step":
+            progress.update(
+                task,
+                completed=done + cost[event["stage"]] * event["step"],
+                detail=f"step {event['step']}/{event['steps']}, loss {event['loss']:.4f}",
+            )
+        elif event["event"] == "note":
+            progress.console.print(event["text"], highlight=False)
 
+    try:
         yield listen
+    finally:
+        if progress.live.is_started:
+            progress.stop()

@@ -99,11 +99,18 @@ def reconstruct(
         "clip": str(Path(clip_path).resolve()),
         "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
     }
-    save_config(out / CONFIG, config, origin)
+    if not (out / CONFIG).exists():
+        save_config(out / CONFIG, config, origin)
     log: list[dict[str, Any]] = _read_log(out / LOG) if resume else []
     with (out / LOG).open("a" if resume else "w") as file:
 
         def log_and_listen(event: dict[str, Any]) -> None:
+            if event["event"] == "resume":
+                # What was logged after the checkpoint is done again.
+                log[:] = [row for row in log if _before(row, event)]
+                file.truncate(0)
+                file.writelines(json.dumps(row) + "\n" for row in log)
+                return
             log.append(event)
             file.write(json.dumps(event) + "\n")
             file.flush()
@@ -126,7 +133,21 @@ def reconstruct(
 
 
 def _read_log(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    """The rows of a log; a last line that was cut off when the run was killed is left out."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def _before(row: dict[str, Any], resume: dict[str, Any]) -> bool:
+    """Whether a logged event happened before the checkpoint that a run continues from."""
+    if "index" not in row:
+        return row["event"] != "skipped"
+    return (row["index"], row.get("step", 0)) <= (resume["index"], resume["step"])
 
 
 def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -> dict[str, float]:

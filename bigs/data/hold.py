@@ -251,6 +251,10 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
     points = _entity_array(where, entity, "pts.cano", ("N", 3))
     if len(points) == 0:
         raise InputError(f"{where}.pts.cano: expected at least one point, found none")
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6 * np.abs(points).max()) < 3:
+        raise InputError(
+            f"{where}.pts.cano: expected points that span a volume, found {len(points)} in a plane"
+        )
     scale = _read_scale(f"{where}.obj_scale", require(f"{where}.obj_scale", entity, "obj_scale"))
     norm_mat = _entity_array(where, entity, "norm_mat", (4, 4))
     if not np.allclose(norm_mat[3], [0, 0, 0, 1]) or abs(np.linalg.det(norm_mat[:3, :3])) < 1e-12:

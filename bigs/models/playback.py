@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -212,13 +213,14 @@ def save_playback(path: Path, playback: Playback) -> None:
         named = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name != "splats"}
         named |= {f"splats.{key}": value for key, value in obj.splats._asdict().items()}
         tensors |= {f"object.{key}": value for key, value in named.items()}
-    metadata = {
-        "format": FORMAT,
+    facts = {
         "name": playback.name,
-        "frame_names": json.dumps(playback.frame_names),
-        "size": json.dumps([playback.width, playback.height]),
-        "normalize_shift": json.dumps(playback.normalize_shift),
+        "frame_names": playback.frame_names,
+        "size": [playback.width, playback.height],
+        "normalize_shift": playback.normalize_shift,
     }
+    # One key beside the format: the writer's order of keys differs from run to run, and files shall not.
+    metadata = {"bigs": json.dumps({"format": FORMAT, **facts})}
     # Shared storage (one canonical hand for two sides) is written twice: a reader then needs no special case.
     with atomic_write(path) as file:
         file.write(save({key: value.contiguous().clone() for key, value in tensors.items()}, metadata))
@@ -234,7 +236,7 @@ def load_playback(path: Path) -> Playback:
         raise InputError(f"{path}: expected a finished run's scene, found no such file")
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
+            metadata = json.loads((file.metadata() or {}).get("bigs", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
@@ -249,7 +251,7 @@ def load_playback(path: Path) -> Playback:
         ) from error
 
 
-def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Playback:
+def _assemble(metadata: dict[str, Any], tensors: dict[str, Tensor]) -> Playback:
     """A playback from the contents of its file; whatever is missing raises as it comes."""
 
     def part(prefix: str) -> dict[str, Tensor]:
@@ -266,14 +268,14 @@ def _assemble(metadata: dict[str, str], tensors: dict[str, Tensor]) -> Playback:
     if "object.verts" in tensors:
         rest = {k: v for k, v in part("object.").items() if not k.startswith("splats.")}
         obj = ObjectPlayback(**rest, splats=CanonicalObject(**part("object.splats.")))
-    width, height = json.loads(metadata["size"])
+    width, height = metadata["size"]
     return Playback(
         metadata["name"],
-        tuple(json.loads(metadata["frame_names"])),
+        tuple(metadata["frame_names"]),
         tensors["K"],
         width,
         height,
-        tuple(json.loads(metadata["normalize_shift"])),
+        tuple(metadata["normalize_shift"]),
         tensors.get("light"),
         hands,
         obj,

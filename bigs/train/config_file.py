@@ -24,7 +24,8 @@ def to_plain(config: Any) -> Any:
         return {item.name: {k: v for k, v in to_plain(item).items() if k != "name"} for item in config}
     if isinstance(config, tuple):
         return [to_plain(item) for item in config]
-    return config
+    # A copy, so that changing the plain form changes no preset.
+    return dict(config) if isinstance(config, dict) else config
 
 
 def from_plain(plain: Any, where: str = "config") -> RunConfig:
@@ -56,19 +57,23 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
         node = plain
         for depth, key in enumerate(keys):
             is_last = depth == len(keys) - 1
-            may_be_new = is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
+            may_be_new = bool(key) and is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
             if not separator or not isinstance(node, dict) or not (key in node or may_be_new):
                 known = f"; there are {', '.join(node)}" if isinstance(node, dict) else ""
                 raise InputError(f"--set {change}: expected path=value, found no setting {key!r}{known}")
             if not is_last:
                 node = node[key]
-        node[keys[-1]] = _scalar(text)
+        node[keys[-1]] = _scalar(change, text)
     return from_plain(plain, "--set")
 
 
-def _scalar(text: str) -> Any:
+def _scalar(change: str, text: str) -> Any:
     """A value as YAML reads it, except that 1e-3 is a number, too."""
-    value = yaml.safe_load(text)
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"--set {change}: expected a value, found {text!r} ({reason})") from error
     if isinstance(value, str):
         try:
             return float(value)
@@ -94,7 +99,7 @@ def load_config(path: Path) -> RunConfig:
         data = yaml.safe_load(path.read_text())
     except OSError as error:
         raise InputError(f"{path}: expected a configuration file, found none ({error.strerror})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from error
     if not isinstance(data, dict) or "config" not in data:
         raise InputError(f"{path}: expected a key 'config', found {type(data).__name__} without it")

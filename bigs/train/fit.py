@@ -26,9 +26,10 @@ from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage, Stage
 from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
+from bigs.train.optim import GROUPS
 from bigs.train.scale_search import search_object_scale
 from bigs.train.targets import Targets, crop_box, load_targets
-from bigs.train.terms import Evidence
+from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence
 from bigs.types import Side
 
 # Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
@@ -82,6 +83,9 @@ def fit(
     digest = run_digest(clip, scene, config)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
     first = position.stage if position else 0
+    if position:
+        done = position.resume["step"] if position.resume else 0
+        listen({"event": "resume", "index": first, "step": done})
     sources = _EvidenceSource(clip, unknown, scene, config)
 
     for index, stage in enumerate(config.stages):
@@ -122,7 +126,7 @@ def _optimise(
     listen: Listener,
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
-        listen({"event": "step", "stage": stage.name, **progress._asdict()})
+        listen({"event": "step", "stage": stage.name, "index": index, **progress._asdict()})
         if checkpoints and progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             save_checkpoint(checkpoints, scene, digest, index, state)
 
@@ -144,15 +148,14 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
 
 
 def run_digest(clip: Clip, scene: Scene, config: RunConfig) -> str:
-    """Identifies what a checkpoint belongs to: version, configuration and the start values it led to."""
+    """Identifies what a checkpoint belongs to: version, configuration, images, masks and start values."""
     text = json.dumps([bigs.__version__, clip.name, list(clip.frame_names), asdict(config)], sort_keys=True)
     digest = hashlib.sha256(text.encode())
-    for poses in scene.hand_poses.values():
-        digest.update(poses.base_pose.numpy().tobytes())
-    for splats in scene.hand_splats.values():
-        digest.update(splats.model.v_template.numpy().tobytes())
-    if scene.object_splats is not None:
-        digest.update(scene.object_splats.base_points.numpy().tobytes())
+    for path in (*clip.image_paths, *clip.mask_paths):
+        digest.update(path.read_bytes())
+    # Parameters hold the fields' random start; buffers hold poses, surface and the hand model.
+    for values in (*scene.parameters(), *scene.buffers()):
+        digest.update(values.detach().numpy().tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -205,10 +208,49 @@ INSET = 1.85
 
 
 def check_plan(config: RunConfig) -> None:
-    """Raise `InputError` when a plan has no stages or two of the same name."""
+    """Refuse a configuration that cannot run, before anything is computed or written.
+
+    Raises:
+        InputError: no stage, two of one name, an unknown group or term, or a number out of range.
+    """
     names = [stage.name for stage in config.stages]
     if not names:
         raise InputError("config stages: expected at least one stage, found none")
     repeated = {name for name in names if names.count(name) > 1}
     if repeated:
         raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
+    least = {
+        "checkpoint_every": (config.checkpoint_every, 1),
+        "initial.surface_resolution": (config.initial.surface_resolution, 8),
+        "initial.surface_agreeing": (config.initial.surface_agreeing, 1),
+        "object.n_gaussians": (config.object.n_gaussians, 10),
+        "hand.subdivisions": (config.hand.subdivisions, 0),
+        "raster.eps2d": (config.raster.eps2d, 0.0),
+    }
+    for stage in config.stages:
+        where = f"stages.{stage.name}"
+        if isinstance(stage, ScaleSearchStage):
+            least[f"{where}.candidates"] = (stage.candidates, 1)
+            continue
+        least |= {
+            f"{where}.steps": (stage.steps, 0),
+            f"{where}.image_size": (stage.image_size, 0),
+            f"{where}.frames_per_step": (stage.frames_per_step, 0),
+        }
+        accepted = (*IMAGE_TERMS[stage.step], *TERMS)
+        for kind, given, known in (("lrs", stage.lrs, GROUPS), ("weights", stage.weights, accepted)):
+            for name in given:
+                if name not in known:
+                    raise InputError(f"config {where}.{kind}: expected {', '.join(known)}, found {name!r}")
+    for path, (value, lowest) in least.items():
+        if value < lowest:
+            raise InputError(f"config {path}: expected {lowest} or more, found {value}")
+    if config.raster.tile_size not in TILE_SIZES:
+        raise InputError(
+            f"config raster.tile_size: expected {', '.join(map(str, TILE_SIZES))}, "
+            f"found {config.raster.tile_size}"
+        )
+
+
+# What the renderer is compiled for.
+TILE_SIZES = (4, 8, 16)

@@ -120,7 +120,14 @@ def run_stage(
             {**fixed, **scene.canonical(moving)},
             choose_frames(scene.n_frames, stage, seed, state.step),
         )
-        terms = {name: (image_terms.get(name) or TERMS[name])(step) for name in stage.weights}
+        terms = {}
+        for name in stage.weights:
+            try:
+                terms[name] = (image_terms.get(name) or TERMS[name])(step)
+            except InputError as error:
+                # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
+                where = f"stage {stage.name}, step {state.step}"
+                raise FloatingPointError(f"{where}: {name} is not finite: {error}") from error
         loss = weighted_sum(terms, stage.weights)
         if not torch.isfinite(loss):
             bad = [name for name, value in terms.items() if not torch.isfinite(value)]

@@ -1,5 +1,6 @@
 """A recorded scene shows what the scene showed, and survives its file bit for bit."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +169,7 @@ def test_a_file_of_something_else_is_an_input_error(tmp_path: Path) -> None:
     save_file({"x": torch.zeros(2)}, path)
     with pytest.raises(InputError, match=f"expected format {FORMAT}, found None"):
         load_playback(path)
-    save_file({"x": torch.zeros(2)}, path, {"format": "bigs-scene-999"})
+    save_file({"x": torch.zeros(2)}, path, {"bigs": json.dumps({"format": "bigs-scene-999"})})
     with pytest.raises(InputError, match="found bigs-scene-999"):
         load_playback(path)
     path.write_bytes(b"\x00" * 100)
