@@ -139,7 +139,7 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
         _out.print(str(path), markup=False, highlight=False, soft_wrap=True)
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "info": info,
     "reconstruct": reconstruct,

@@ -90,11 +90,7 @@ def test_settings_that_cannot_be(
         (FloatingPointError("stage joint, step 3: image is not finite"), 3, ["joint", "checkpoint is kept"]),
         (KeyboardInterrupt(), 130, ["interrupted", "--resume"]),
         (InputError("x: expected [bold]1[/bold], found 2"), 2, ["x: expected [bold]1[/bold], found 2"]),
-        (
-            OSError(28, "No space left", "run/scene.safetensors"),
-            None,
-            ["scene.safetensors", "expected", "found: No space left"],
-        ),
+        (OSError(28, "No space left", "run/x.ply"), 4, ["x.ply", "expected", "found: No space left"]),
     ],
 )
 def test_other_ends_are_one_line_too(

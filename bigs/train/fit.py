@@ -238,16 +238,18 @@ def check_plan(config: RunConfig) -> None:
             f"{where}.frames_per_step": (stage.frames_per_step, 0),
         }
         accepted = (*IMAGE_TERMS[stage.step], *TERMS)
-        for kind, given, known in (("lrs", stage.lrs, GROUPS), ("weights", stage.weights, accepted)):
+        for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
             for name in given:
                 if name not in known:
-                    raise InputError(f"config {where}.{kind}: expected {', '.join(known)}, found {name!r}")
+                    raise InputError(
+                        f"config {where}: expected {kind} out of {', '.join(known)}, found {name!r}"
+                    )
     for path, (value, lowest) in least.items():
         if value < lowest:
             raise InputError(f"config {path}: expected {lowest} or more, found {value}")
     if config.raster.tile_size not in TILE_SIZES:
         raise InputError(
-            f"config raster.tile_size: expected {', '.join(map(str, TILE_SIZES))}, "
+            f"config raster.tile_size: expected {TILE_SIZES[0]}, {TILE_SIZES[1]} or {TILE_SIZES[2]}, "
             f"found {config.raster.tile_size}"
         )
 
