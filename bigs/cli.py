@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from bigs.train.config import RunConfig
 
 # The names of `train.presets.PRESETS`, spelled out because importing those takes seconds; a test compares.
-Preset = Literal["smoke", "fast", "full", "paper"]
+Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 Format = Literal["ply", "poses", "challenge", "mesh", "hand-meshes"]
 
 _out = Console()
 _err = Console(stderr=True)
 
 
-def demo(out: Path = Path("demo_run"), preset: Preset = "fast", threads: int = 0, seed: int = 0) -> None:
+def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0, seed: int = 0) -> None:
     """Make a little clip of two hands and a bottle, reconstruct it, and show how much better it became.
 
     Args:
@@ -76,7 +76,7 @@ def reconstruct(
     Args:
         clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
         out: the run folder to make.
-        preset: smoke (seconds), fast (a minute or two), full, or paper (the paper's equations and weights).
+        preset: smoke (seconds), demo, fast (two minutes), full, or paper (the paper's equations and weights).
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
         gt: ground truth (gt.npz) to score against; the reconstruction never sees it.
         resume: continue an interrupted run in the same folder.
