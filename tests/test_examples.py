@@ -74,6 +74,7 @@ def test_pose_hand(tmp_path: Path) -> None:
     assert mesh.is_watertight and 0.05 < mesh.extents.max() < 0.2
 
 
+@pytest.mark.slow
 def test_reconstruct_arctic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     submission = load("reconstruct_arctic").main(tmp_path / "arctic", frames=12)
     assert submission.name == "synthetic_bottle_0.pt"
