@@ -45,6 +45,11 @@ class ScaleSearchStage:
     # Relative sizes tried: `candidates` values evenly in 1 - span ... 1 + span.
     span: float = 0.14
     candidates: int = 29
+    # Contact cannot tell the object in front of a palm from the object behind it, occlusion can: the label
+    # term at this weight, this size and over this many frames.
+    labels_weight: float = 2.0
+    image_size: int = 100
+    frames: int = 12
 
 
 Stage = OptimizeStage | ScaleSearchStage

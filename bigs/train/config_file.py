@@ -13,7 +13,7 @@ import yaml
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
-from bigs.train.config import RunConfig, ScaleSearchStage
+from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage
 
 
 def to_plain(config: Any) -> Any:
@@ -142,7 +142,8 @@ def _build_tuple(arguments: tuple[Any, ...], plain: Any, where: str) -> tuple[An
 def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> Any:
     if not isinstance(plain, dict):
         raise InputError(f"{where}: expected a stage, found {plain!r}")
-    searches = {f.name for f in dataclasses.fields(ScaleSearchStage)} - {"name", "step"}
+    optimize = {f.name for f in dataclasses.fields(OptimizeStage)}
+    searches = {f.name for f in dataclasses.fields(ScaleSearchStage)} - optimize
     kind = ScaleSearchStage if searches & set(plain) else typing.get_args(kinds)[0]
     return _build_dataclass(kind, {"name": name, **plain}, where)
 

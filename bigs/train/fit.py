@@ -29,7 +29,8 @@ from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.optim import GROUPS
 from bigs.train.scale_search import search_object_scale
 from bigs.train.targets import Targets, crop_box, load_targets
-from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence
+from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence, labels
+from bigs.train.terms import Step as LossStep
 from bigs.types import Side
 
 # Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
@@ -98,7 +99,7 @@ def fit(
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
         began = time.perf_counter()
         if isinstance(stage, ScaleSearchStage):
-            factor, _, _ = search_object_scale(scene, stage, sources.touching)
+            factor, _, _ = search_object_scale(scene, stage, sources.touching, sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
         else:
             continues = position.resume if position and index == first else None
@@ -126,7 +127,7 @@ def _optimise(
     listen: Listener,
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
-        listen({"event": "step", "stage": stage.name, "index": index, **progress._asdict()})
+        listen({"event": "step", "stage": stage.name, **progress._asdict(), "index": index})
         if checkpoints and progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             save_checkpoint(checkpoints, scene, digest, index, state)
 
@@ -176,10 +177,19 @@ class _EvidenceSource:
         }
         self._targets: dict[int, Targets] = {}
 
-    def evidence(self, stage: OptimizeStage) -> Evidence:
+    def evidence(self, stage: Stage) -> Evidence:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(targets, self.touching, silhouettes, self.config.contact, self.config.raster)
+
+    def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:
+        """The label term of the scene as it is, over some frames: which subject hides which."""
+        evidence = self.evidence(stage)
+        frames = torch.linspace(0, len(self.clip) - 1, min(stage.frames, len(self.clip))).round().long()
+        entities = self.scene.entities
+        with torch.no_grad():
+            canonical = self.scene.canonical(entities)
+        return lambda: float(labels(LossStep(self.scene, evidence, entities, canonical, frames)))
 
     def targets(self, size: int) -> Targets:
         if size not in self._targets:
@@ -231,6 +241,8 @@ def check_plan(config: RunConfig) -> None:
         where = f"stages.{stage.name}"
         if isinstance(stage, ScaleSearchStage):
             least[f"{where}.candidates"] = (stage.candidates, 1)
+            least[f"{where}.image_size"] = (stage.image_size, 0)
+            least[f"{where}.frames"] = (stage.frames, 1)
             continue
         least |= {
             f"{where}.steps": (stage.steps, 0),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -13,11 +15,15 @@ from bigs.types import Side
 
 @torch.no_grad()
 def search_object_scale(
-    scene: Scene, stage: ScaleSearchStage, touching: dict[Side, Tensor]
+    scene: Scene,
+    stage: ScaleSearchStage,
+    touching: dict[Side, Tensor],
+    occlusion: Callable[[], float] = lambda: 0.0,
 ) -> tuple[float, Tensor, Tensor]:
     """Set the object's scale, which leaves its projection alone, to where the hands touch its surface best.
 
-    The cost is the contact term's own.
+    The cost is the contact term's own plus `stage.labels_weight` times `occlusion()`: how badly the scene as
+    it is agrees with what hides what in the images.
 
     Returns:
         The chosen factor on the present scale, the factors tried [C] and their costs [C]. The scene is left
@@ -34,6 +40,7 @@ def search_object_scale(
         for side, verts in hands.items():
             distances = scale * scene.object_distance(scene.in_object_frame(verts, frames))
             costs[c] += surface_contact(distances, touching[side]) / len(hands)
+        costs[c] += stage.labels_weight * occlusion()
     if not any(bool(t.any()) for t in touching.values()):
         scene.object_poses.log_scale.copy_(start)
         return 1.0, factors, costs
