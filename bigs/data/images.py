@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.types import MASK_VALUES, Entity
+from bigs.types import MASK_VALUES
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MASK_SUFFIXES = (".png",)
@@ -69,11 +69,6 @@ def read_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
             f"{path}: expected the mask values {expected}, found {', '.join(map(str, other[:4]))}"
         )
     return pixels
-
-
-def entity_mask(labels: np.ndarray, entity: Entity) -> np.ndarray:
-    """Where `labels` shows `entity`: bool, same shape."""
-    return labels == MASK_VALUES[entity]
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, str]:
