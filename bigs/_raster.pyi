@@ -34,7 +34,12 @@ class RasterState:
         """Work done and skipped in the forward pass, summed over the views."""
 
 def rasterize_forward(
-    arrays: _Arrays, width: int, height: int, settings: RasterSettings, render_mode: str
+    arrays: _Arrays,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+    render_mode: str,
+    camera_model: str,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.int32], RasterState]:
     """Colors [V, H, W, D], alphas [V, H, W, 1], means2d [V, N, 2], depths [V, N], radii [V, N, 2], state."""
 
@@ -45,6 +50,7 @@ def rasterize_backward(
     height: int,
     settings: RasterSettings,
     render_mode: str,
+    camera_model: str,
     v_colors: NDArray[Any],
     v_alphas: NDArray[Any],
     wanted: list[bool],

@@ -14,6 +14,7 @@ from bigs.raster.settings import RasterSettings
 from bigs.types import RenderOutput
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+CameraModel = Literal["pinhole", "ortho"]
 Backend = Literal["auto", "rust", "torch", "gsplat"]
 
 # A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
@@ -35,6 +36,7 @@ def rasterization(
     backgrounds: torch.Tensor | None = None,  # [..., C, D]
     pixel_mask: torch.Tensor | None = None,  # [..., C, H, W]
     render_mode: RenderMode = "RGB",
+    camera_model: CameraModel = "pinhole",
     backend: Backend = "auto",
 ) -> RenderOutput:
     """Render 3D Gaussians (paper Eq. 1 and 2) into C cameras, differentiably.
@@ -52,7 +54,7 @@ def rasterization(
         opacities: in [0, 1].
         colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too.
         viewmats: world to camera, OpenCV axes; the 3×3 part must be invertible.
-        Ks: pinhole matrices in pixels without skew; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+        Ks: camera matrices in pixels without skew; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
         width: of the images, pixels.
         height: of the images, pixels.
         settings: every threshold; gsplat's values by default.
@@ -60,6 +62,8 @@ def rasterization(
         pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the
             background with alpha 0.
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
+        camera_model: "pinhole", or "ortho" for parallel rays, x = fx X + cx with fx in pixels per metre. Depth is
+            camera z in both, and so are the near and the far plane.
         backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,
             gsplat for CUDA tensors.
 
@@ -73,6 +77,7 @@ def rasterization(
     """
     settings = RasterSettings() if settings is None else settings
     check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
+    check_choice("camera_model", camera_model, ("pinhole", "ortho"))
     check_choice("backend", backend, ("auto", "rust", "torch", "gsplat"))
     tensors = {
         "means": means,
@@ -93,14 +98,16 @@ def rasterization(
     if backend == "rust":
         if means.is_cuda:
             raise InputError("means: expected CPU tensors for backend 'rust', found a CUDA tensor")
-        return _render_rust(tensors, pixel_mask, batch, settings, render_mode)
+        return _render_rust(tensors, pixel_mask, batch, settings, render_mode, camera_model)
     for name, tensor in tensors.items():
         check_finite(name, tensor)
     expanded = _expanded(tensors, batch)
     mask = None if pixel_mask is None else pixel_mask.expand(*batch.shape, *pixel_mask.shape[-3:])
     if backend == "gsplat":
-        return RenderOutput(*cuda.rasterize(expanded, mask, batch.width, batch.height, settings, render_mode))
-    return _render_torch(expanded, mask, batch, settings, render_mode)
+        return RenderOutput(
+            *cuda.rasterize(expanded, mask, batch.width, batch.height, settings, render_mode, camera_model)
+        )
+    return _render_torch(expanded, mask, batch, settings, render_mode, camera_model)
 
 
 class _Batch(NamedTuple):
@@ -217,6 +224,7 @@ def _render_rust(
     batch: _Batch,
     settings: RasterSettings,
     render_mode: RenderMode,
+    camera_model: CameraModel,
 ) -> RenderOutput:
     def slabs(name: str, axes: int, camera_axis: bool = False) -> torch.Tensor:
         return _slabs(tensors[name], batch.shape, axes, camera_axis)
@@ -233,7 +241,14 @@ def _render_rust(
     mask = None if pixel_mask is None else _slabs(pixel_mask, batch.shape, 2, True)
     try:
         colors, alphas, info = rust.rasterize(
-            inputs, slabs("Ks", 2, True), mask, batch.width, batch.height, settings, render_mode
+            inputs,
+            slabs("Ks", 2, True),
+            mask,
+            batch.width,
+            batch.height,
+            settings,
+            render_mode,
+            camera_model,
         )
     except ValueError as error:
         # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
@@ -262,6 +277,7 @@ def _render_torch(
     batch: _Batch,
     settings: RasterSettings,
     render_mode: RenderMode,
+    camera_model: CameraModel,
 ) -> RenderOutput:
     results = []
     for index in np.ndindex(*batch.shape, batch.cameras):
@@ -282,6 +298,7 @@ def _render_torch(
                 background=background,
                 pixel_mask=None if pixel_mask is None else pixel_mask[index],
                 render_mode=render_mode,
+                camera_model=camera_model,
             )
         )
     lead = (*batch.shape, batch.cameras)

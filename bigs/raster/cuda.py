@@ -33,6 +33,7 @@ def rasterize(
     height: int,
     settings: RasterSettings,
     render_mode: str,
+    camera_model: str,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render checked inputs with equal batch axes, by the names of `bigs.raster.rasterization`.
 
@@ -60,6 +61,7 @@ def rasterize(
         tile_size=settings.tile_size,
         rasterize_mode="antialiased" if settings.antialiased else "classic",
         render_mode=render_mode,
+        camera_model=camera_model,
         packed=False,
     )
     if pixel_mask is not None:

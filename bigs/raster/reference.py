@@ -37,12 +37,15 @@ def rasterize_view(
     background: torch.Tensor | None,  # [D]
     pixel_mask: torch.Tensor | None,  # [H, W]
     render_mode: str,
+    camera_model: str,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
     """Render one view: colors [H, W, D], alphas [H, W, 1], and means2d [N, 2], depths [N], radii [N, 2].
 
     Inputs are those of `bigs.raster.rasterization`, checked.
     """
-    screen, info = _project(means, quats, scales, opacities, viewmat, K, width, height, settings)
+    screen, info = _project(
+        means, quats, scales, opacities, viewmat, K, width, height, settings, camera_model
+    )
     channels = []
     if "RGB" in render_mode:
         channels.append(colors[screen.ids])
@@ -80,21 +83,10 @@ def _rotations(quats: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def _project(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    viewmat: torch.Tensor,
-    K: torch.Tensor,
-    width: int,
-    height: int,
-    settings: RasterSettings,
-) -> tuple[_Screen, dict[str, torch.Tensor]]:
-    """EWA splatting: the Gaussian under the Jacobian of the projection at its centre (Zwicker 2001)."""
-    in_front = means @ viewmat[2, :3] + viewmat[2, 3]
-    ids = torch.nonzero((in_front > settings.near_plane) & (in_front < settings.far_plane))[:, 0]
-    points = means[ids] @ viewmat[:3, :3].T + viewmat[:3, 3]
+def _pinhole(
+    points: torch.Tensor, K: torch.Tensor, width: int, height: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Camera points [M, 3] in pixels [M, 2], and the derivative [M, 2, 3] that Gaussians are shaped with."""
     x, y, z = points.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
@@ -111,6 +103,36 @@ def _project(
         ],
         dim=-2,
     )
+    return means2d, jacobian
+
+
+def _orthographic(
+    points: torch.Tensor, K: torch.Tensor, width: int, height: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same along parallel rays: K maps metres to pixels wherever they are."""
+    flat = torch.cat([K[:2, :2], torch.zeros_like(K[:2, :1])], dim=-1)
+    return points @ flat.T + K[:2, 2], flat
+
+
+def _project(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+    camera_model: str,
+) -> tuple[_Screen, dict[str, torch.Tensor]]:
+    """EWA splatting: the Gaussian under the Jacobian of the projection at its centre (Zwicker 2001)."""
+    in_front = means @ viewmat[2, :3] + viewmat[2, 3]
+    ids = torch.nonzero((in_front > settings.near_plane) & (in_front < settings.far_plane))[:, 0]
+    points = means[ids] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = points[:, 2]
+    lens = _orthographic if camera_model == "ortho" else _pinhole
+    means2d, jacobian = lens(points, K, width, height)
     axes = jacobian @ viewmat[:3, :3] @ (_rotations(quats[ids]) * scales[ids][:, None, :])  # [M, 2, 3]
     sharp = axes @ axes.transpose(-1, -2)
     covs2d = sharp + settings.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)

@@ -41,7 +41,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any,
         constants: tuple[torch.Tensor, torch.Tensor | None],
-        call: tuple[int, int, RasterSettings, str],
+        call: tuple[int, int, RasterSettings, str, str],
         info: dict[str, Any],
         *inputs: torch.Tensor | None,
     ) -> tuple[torch.Tensor, ...]:
@@ -63,7 +63,7 @@ class _Rasterize(torch.autograd.Function):
         if v_alphas is None:
             v_alphas = v_colors.new_zeros(*ctx.image_shape[:-1], 1)
         wanted = list(ctx.needs_input_grad[3:])
-        width, height, settings, render_mode = ctx.call
+        width, height, settings, render_mode, camera_model = ctx.call
         *gradients, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
             _engine_arrays(inputs, (Ks, pixel_mask)),
@@ -71,6 +71,7 @@ class _Rasterize(torch.autograd.Function):
             height,
             settings,
             render_mode,
+            camera_model,
             _array(v_colors),
             _array(v_alphas),
             wanted,
@@ -97,6 +98,7 @@ def rasterize(
     height: int,
     settings: RasterSettings,
     render_mode: str,
+    camera_model: str,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render checked inputs whose leading axes are [entries or 1, cameras or 1].
 
@@ -107,6 +109,7 @@ def rasterize(
         ValueError: a value that is not finite, a camera that is none, a setting out of range.
     """
     info: dict[str, Any] = {"tile_size": settings.tile_size}
-    outputs = _Rasterize.apply((Ks, pixel_mask), (width, height, settings, render_mode), info, *inputs)
+    call = (width, height, settings, render_mode, camera_model)
+    outputs = _Rasterize.apply((Ks, pixel_mask), call, info, *inputs)
     colors, alphas, info["means2d"], info["depths"], info["radii"] = outputs
     return colors, alphas, info

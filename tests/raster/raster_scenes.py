@@ -56,6 +56,13 @@ def scene(
     return {**{k: v.to(dtype) for k, v in tensors.items()}, "width": width, "height": height}
 
 
+def without_perspective(inputs: dict[str, Any]) -> dict[str, Any]:
+    """The scene for orthographic cameras: focal lengths that show at depth 1.2 what they showed before."""
+    Ks = inputs["Ks"].clone()
+    Ks[..., [0, 1], [0, 1]] /= 1.2
+    return {**inputs, "Ks": Ks, "camera_model": "ortho"}
+
+
 def _skew(v: torch.Tensor) -> torch.Tensor:
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)

@@ -114,6 +114,8 @@ def test_settings_are_named(change, words):
 def test_choices_are_named():
     with pytest.raises(InputError, match="render_mode: expected one of RGB"):
         rasterization(**scene(), render_mode="depth")
+    with pytest.raises(InputError, match="camera_model: expected one of pinhole, ortho"):
+        rasterization(**scene(), camera_model="fisheye")
     with pytest.raises(InputError, match="backend: expected one of auto"):
         rasterization(**scene(), backend="cuda")
     with pytest.raises(InputError, match="width: expected a positive whole number of pixels, found 0"):

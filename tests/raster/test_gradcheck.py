@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from raster_scenes import DIFFERENTIABLE, SMOOTH, scene
+from raster_scenes import DIFFERENTIABLE, SMOOTH, scene, without_perspective
 
 from bigs.raster import RasterSettings, rasterization
 
@@ -19,13 +19,18 @@ def check(inputs, names, **options):
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
-def test_every_input(name, mode):
+@pytest.mark.parametrize("camera_model", ["pinhole", "ortho"])
+def test_every_input(name, mode, camera_model):
+    inputs = scene(n=6, width=9, height=7)
+    if camera_model == "ortho":
+        inputs = without_perspective(inputs)
+        # Wide enough that alpha is nowhere near the 1e-10 below which expected depth is no quotient.
+        inputs["scales"] *= 4
     if name != "viewmats":
-        check(scene(n=6, width=9, height=7), [name], settings=SMOOTH, render_mode=mode)
+        check(inputs, [name], settings=SMOOTH, render_mode=mode)
         return
 
     # The last row of a camera is constant: only the rest may move.
-    inputs = scene(n=6, width=9, height=7)
     last = inputs["viewmats"][..., 3:, :]
 
     def images(rows):

@@ -3,7 +3,7 @@
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from raster_scenes import gradients, relative, scene
+from raster_scenes import gradients, relative, scene, without_perspective
 
 from bigs.raster import RasterSettings, rasterization
 
@@ -90,6 +90,28 @@ def test_white_on_white_is_white_and_culling_is_invisible(seed):
     # Smaller tiles cull more; the pairs that are left are the same.
     small = rasterization(**inputs, settings=RasterSettings(tile_size=4))
     assert torch.equal(small.colors, rasterization(**inputs).colors)
+
+
+def test_without_perspective_distance_changes_nothing_but_depth():
+    inputs = without_perspective(scene(n=40))
+    near = rasterization(**inputs)
+    further = inputs["viewmats"].clone()
+    further[..., 2, 3] += 7.0
+    far = rasterization(**{**inputs, "viewmats": further})
+    assert relative(far.colors, near.colors) < 1e-12
+    seen = near.info["depths"] > 0
+    assert torch.allclose(far.info["depths"][seen], near.info["depths"][seen] + 7.0, atol=1e-12)
+    assert torch.allclose(far.info["means2d"], near.info["means2d"], atol=1e-12)
+
+
+def test_orthographic_is_the_limit_of_a_long_lens():
+    inputs = scene(n=40, spread=0.15)
+    inputs["Ks"][..., [0, 1], [0, 1]] /= 1.2
+    parallel = rasterization(**inputs, camera_model="ortho")
+    distance = 1e6
+    inputs["Ks"][..., [0, 1], [0, 1]] *= distance
+    inputs["viewmats"][..., 2, 3] += distance
+    assert relative(rasterization(**inputs).colors, parallel.colors) < 1e-4
 
 
 def test_a_transparent_gaussian_has_no_gradient_on_its_color():

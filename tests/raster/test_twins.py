@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from raster_scenes import gradients, relative, scene
+from raster_scenes import gradients, relative, scene, without_perspective
 
 from bigs.checks import InputError
 from bigs.raster import RasterSettings, rasterization
@@ -87,6 +87,13 @@ def test_tile_sizes_and_no_cutoffs(tile_size):
     compare(scene(n=40, width=33, height=19), settings=settings)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_orthographic(dtype):
+    inputs = without_perspective(scene(n=150, cameras=2, width=45, height=38, dtype=dtype))
+    compare(inputs, render_mode="RGB+D")
+    compare(inputs, settings=RasterSettings(antialiased=True, near_plane=1.0, far_plane=1.4))
+
+
 def test_opaque_pile_stops_early():
     inputs = scene(n=300, spread=0.05)
     inputs["opacities"] = 0.5 + 0.6 * torch.rand(300).double()  # beyond max_alpha as well
@@ -144,7 +151,7 @@ class FakeGsplat:
 
 def test_gsplat_receives_the_call(monkeypatch):
     monkeypatch.setattr("bigs.raster.cuda._gsplat", FakeGsplat)
-    inputs = scene(n=30, batch=(2,))
+    inputs = without_perspective(scene(n=30, batch=(2,)))
     inputs["colors"] = inputs["colors"][0]
     mask = torch.rand(2, 1, 18, 23) < 0.5
     settings = RasterSettings(antialiased=True, radius_clip=2.0)

@@ -1,6 +1,6 @@
 //! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied.
 
-use bigs_raster::{BatchInputs, BatchShape, Real, Slabs};
+use bigs_raster::{BatchInputs, BatchShape, CameraModel, Real, Slabs};
 use numpy::{
     Element, IntoPyArray, PyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,
@@ -60,7 +60,11 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
     }
 
     /// The same as borrowed slabs, and the sizes they imply.
-    pub(crate) fn inputs(&self, width: usize, height: usize) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
+    pub(crate) fn inputs(
+        &self,
+        (width, height): (usize, usize),
+        camera_model: CameraModel,
+    ) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
         let slabs = |index: usize| slabs(NAMES[index], &self.floats[index]);
         let inputs = BatchInputs {
             means: slabs(0)?,
@@ -70,6 +74,7 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
             colors: slabs(4)?,
             viewmats: slabs(5)?,
             ks: slabs(6)?,
+            camera_model,
             backgrounds: self
                 .backgrounds
                 .as_ref()

@@ -4,7 +4,7 @@ mod convert;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use bigs_raster::{Batch, BatchState, RasterError, RasterSettings, Real, RenderMode, Wanted};
+use bigs_raster::{Batch, BatchState, CameraModel, RasterError, RasterSettings, Real, RenderMode, Wanted};
 use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -94,6 +94,14 @@ fn mode_named(name: &str) -> PyResult<RenderMode> {
     })
 }
 
+fn camera_model_named(name: &str) -> PyResult<CameraModel> {
+    CameraModel::from_name(name).ok_or_else(|| {
+        PyValueError::new_err(format!(
+            "camera_model: expected one of pinhole, ortho, found '{name}'"
+        ))
+    })
+}
+
 /// Runs the engine without the interpreter lock; a panic, which would be a bug, becomes a `RuntimeError`.
 fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + Send) -> PyResult<R> {
     py.detach(|| catch_unwind(AssertUnwindSafe(work)))
@@ -106,9 +114,9 @@ fn forward<'py, T: Scalar>(
     arrays: &Arrays<'py, T>,
     (width, height): (usize, usize),
     settings: &RasterSettings,
-    mode: RenderMode,
+    (mode, camera_model): (RenderMode, CameraModel),
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (shape, inputs) = arrays.inputs(width, height)?;
+    let (shape, inputs) = arrays.inputs((width, height), camera_model)?;
     let (images, state) = run(py, || Batch::new(shape, inputs, settings, mode)?.render())?;
     let (views, n) = (shape.views(), shape.gaussians);
     (
@@ -141,8 +149,10 @@ fn rasterize_forward<'py>(
     height: usize,
     settings: Settings,
     render_mode: &str,
+    camera_model: &str,
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (settings, mode, size) = (settings.into(), mode_named(render_mode)?, (width, height));
+    let (settings, size) = (settings.into(), (width, height));
+    let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
     match Arrays::<f32>::extract(arrays) {
         Ok(single) => forward(py, &single, size, &settings, mode),
         Err(_) => forward(py, &Arrays::<f64>::extract(arrays)?, size, &settings, mode),
@@ -155,11 +165,11 @@ fn backward<'py, T: Scalar>(
     arrays: &Arrays<'py, T>,
     (width, height): (usize, usize),
     settings: &RasterSettings,
-    mode: RenderMode,
+    (mode, camera_model): (RenderMode, CameraModel),
     (v_colors, v_alphas): (&Bound<'py, PyAny>, &Bound<'py, PyAny>),
     wanted: Wanted,
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (shape, inputs) = arrays.inputs(width, height)?;
+    let (shape, inputs) = arrays.inputs((width, height), camera_model)?;
     let (v_colors, v_alphas) = (
         slice::<T>("v_colors", v_colors)?,
         slice::<T>("v_alphas", v_alphas)?,
@@ -193,11 +203,13 @@ fn rasterize_backward<'py>(
     height: usize,
     settings: Settings,
     render_mode: &str,
+    camera_model: &str,
     v_colors: &Bound<'py, PyAny>,
     v_alphas: &Bound<'py, PyAny>,
     wanted: [bool; 7],
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (settings, mode, size) = (settings.into(), mode_named(render_mode)?, (width, height));
+    let (settings, size) = (settings.into(), (width, height));
+    let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
     let [means, quats, scales, opacities, colors, viewmats, backgrounds] = wanted;
     let wanted = Wanted {
         means,

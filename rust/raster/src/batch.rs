@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, CameraModel, Intrinsics};
 use crate::composite::Cotangents;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
@@ -100,6 +100,8 @@ pub struct BatchInputs<'a, T> {
     pub viewmats: Slabs<'a, T>,
     /// Camera matrices.
     pub ks: Slabs<'a, T>,
+    /// How every camera projects.
+    pub camera_model: CameraModel,
     /// One value per channel.
     pub backgrounds: Option<Slabs<'a, T>>,
     /// One value per pixel; false is not rendered.
@@ -279,6 +281,7 @@ impl<'a, T: Real> Batch<'a, T> {
                     shape.width,
                     shape.height,
                 )
+                .map(|camera| camera.with_model(inputs.camera_model))
             })
             .collect::<Result<_, _>>()?;
         Ok(Self {

@@ -1,14 +1,35 @@
-//! A pinhole camera.
+//! Pinhole and orthographic cameras.
 
 use crate::error::RasterError;
 use crate::real::Real;
 
+/// How a camera maps a point (X, Y, Z) of its own frame to the image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CameraModel {
+    /// x = fx X / Z + cx: distant things are small.
+    #[default]
+    Pinhole,
+    /// x = fx X + cx: size does not depend on distance. Z still orders, and still has a near and a far plane.
+    Orthographic,
+}
+
+impl CameraModel {
+    /// The model gsplat calls `pinhole` or `ortho`.
+    pub fn from_name(name: &str) -> Option<Self> {
+        match name {
+            "pinhole" => Some(Self::Pinhole),
+            "ortho" => Some(Self::Orthographic),
+            _ => None,
+        }
+    }
+}
+
 /// Focal lengths and principal point, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics<T> {
-    /// Focal length along x.
+    /// Focal length along x; of an orthographic camera, pixels per unit of length.
     pub fx: T,
-    /// Focal length along y.
+    /// The same along y.
     pub fy: T,
     /// Principal point, x.
     pub cx: T,
@@ -16,7 +37,7 @@ pub struct Intrinsics<T> {
     pub cy: T,
 }
 
-/// A pinhole camera with OpenCV axes (x right, y down, z forward); the centre of pixel (column i, row j) is
+/// A camera with OpenCV axes (x right, y down, z forward); the centre of pixel (column i, row j) is
 /// (i + ½, j + ½).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera<T> {
@@ -24,12 +45,13 @@ pub struct Camera<T> {
     pub(crate) rotation: [[T; 3]; 3],
     pub(crate) translation: [T; 3],
     pub(crate) k: Intrinsics<T>,
+    pub(crate) model: CameraModel,
     pub(crate) width: usize,
     pub(crate) height: usize,
 }
 
 impl<T: Real> Camera<T> {
-    /// A camera from its row-major world-to-camera matrix. The 3×3 part need not be orthonormal.
+    /// A pinhole camera from its row-major world-to-camera matrix. The 3×3 part need not be orthonormal.
     ///
     /// # Errors
     /// A matrix that is not finite, is singular or whose last row is not 0 0 0 1, a focal length that is not
@@ -76,9 +98,16 @@ impl<T: Real> Camera<T> {
             rotation,
             translation: [viewmat[0][3], viewmat[1][3], viewmat[2][3]],
             k,
+            model: CameraModel::Pinhole,
             width,
             height,
         })
+    }
+
+    /// The same camera with another way to project.
+    #[must_use]
+    pub fn with_model(self, model: CameraModel) -> Self {
+        Self { model, ..self }
     }
 
     /// Image width in pixels.

@@ -60,7 +60,7 @@ mod tiles;
 pub use batch::{
     Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs, Wanted,
 };
-pub use camera::{Camera, Intrinsics};
+pub use camera::{Camera, CameraModel, Intrinsics};
 pub use error::RasterError;
 pub use gaussians::Gaussians;
 pub use real::{Arithmetic, Real};

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::camera::Camera;
+use crate::camera::{Camera, CameraModel};
 use crate::cov::{
     Mat3, Vec3, Whitening, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, whiten,
     whiten_vjp,
@@ -57,7 +57,9 @@ struct Footprint<T> {
     axes: Mat3<T>,
     /// Camera rotation · axes · diag(scales).
     shape: Mat3<T>,
-    /// x/z and y/z after the limit, and whether each is free (within it).
+    /// Pixels per unit of length at the centre.
+    gains: [T; 2],
+    /// x/z and y/z after the limit, and whether each is free (within it). Without perspective zero, and held.
     slopes: [T; 2],
     free: [bool; 2],
     /// Rows of A = J · shape.
@@ -70,6 +72,19 @@ fn to_camera<T: Real>(camera: &Camera<T>, mean: Vec3<T>) -> Vec3<T> {
     [0, 1, 2].map(|i| rotated[i] + camera.translation[i])
 }
 
+/// Where the camera shows the centre, in pixels.
+#[inline(always)]
+fn centre<T: Real>(camera: &Camera<T>, point: Vec3<T>) -> [T; 2] {
+    let k = &camera.k;
+    match camera.model {
+        CameraModel::Pinhole => [
+            k.fx * (point[0] / point[2]) + k.cx,
+            k.fy * (point[1] / point[2]) + k.cy,
+        ],
+        CameraModel::Orthographic => [k.fx * point[0] + k.cx, k.fy * point[1] + k.cy],
+    }
+}
+
 #[inline(always)]
 fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
     let (unit_quat, inverse_quat_length) = normalize_quat(quat);
@@ -80,17 +95,26 @@ fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: V
         .map(|row| [0, 1, 2].map(|j| row[0] * scaled[0][j] + row[1] * scaled[1][j] + row[2] * scaled[2][j]));
 
     let k = &camera.k;
-    let inverse_z = T::ONE / point[2];
-    let margin = T::of(FRUSTUM_MARGIN);
-    let limit_slope = |p: T, f: T, c: T, size: usize| {
-        let size = T::of(size as f64);
-        let slope = p * inverse_z;
-        let limited = slope.limit(-(c + margin * size) / f, (size - c + margin * size) / f);
-        (limited, limited == slope)
+    let ([gx, gy], [(sx, free_x), (sy, free_y)]) = match camera.model {
+        CameraModel::Pinhole => {
+            let inverse_z = T::ONE / point[2];
+            let margin = T::of(FRUSTUM_MARGIN);
+            let limit_slope = |p: T, f: T, c: T, size: usize| {
+                let size = T::of(size as f64);
+                let slope = p * inverse_z;
+                let limited = slope.limit(-(c + margin * size) / f, (size - c + margin * size) / f);
+                (limited, limited == slope)
+            };
+            (
+                [k.fx * inverse_z, k.fy * inverse_z],
+                [
+                    limit_slope(point[0], k.fx, k.cx, camera.width),
+                    limit_slope(point[1], k.fy, k.cy, camera.height),
+                ],
+            )
+        }
+        CameraModel::Orthographic => ([k.fx, k.fy], [(T::ZERO, false); 2]),
     };
-    let (sx, free_x) = limit_slope(point[0], k.fx, k.cx, camera.width);
-    let (sy, free_y) = limit_slope(point[1], k.fy, k.cy, camera.height);
-    let (gx, gy) = (k.fx * inverse_z, k.fy * inverse_z);
     let rows = [
         [0, 1, 2].map(|j| gx * (shape[0][j] - sx * shape[2][j])),
         [0, 1, 2].map(|j| gy * (shape[1][j] - sy * shape[2][j])),
@@ -101,6 +125,7 @@ fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: V
         inverse_quat_length,
         axes,
         shape,
+        gains: [gx, gy],
         slopes: [sx, sy],
         free: [free_x, free_y],
         rows,
@@ -123,9 +148,7 @@ fn splat<T: Real>(
     if !(depth > limits.near && depth < limits.far) {
         return None;
     }
-    let k = &camera.k;
-    let x = k.fx * (point[0] / depth) + k.cx;
-    let y = k.fy * (point[1] / depth) + k.cy;
+    let [x, y] = centre(camera, point);
     let shape = footprint(camera, point, quat, scale);
     let w = whiten(shape.rows[0], shape.rows[1], limits.eps2d)?;
     let opacity = if limits.antialiased {
@@ -272,30 +295,34 @@ pub(crate) fn project_vjp<T: Real>(
         v_compensation,
     );
 
-    let k = &camera.k;
-    let z = shape.point[2];
-    let inverse_z = T::ONE / z;
-    let (gx, gy) = (k.fx * inverse_z, k.fy * inverse_z);
+    let [gx, gy] = shape.gains;
     let [sx, sy] = shape.slopes;
-    // rows = (f/z) (shape₀₁ − slope · shape₂)
+    // rows = gain (shape₀₁ − slope · shape₂)
     let v_shape = [
         v_r0.map(|g| gx * g),
         v_r1.map(|g| gy * g),
         [0, 1, 2].map(|j| -(gx * sx * v_r0[j] + gy * sy * v_r1[j])),
     ];
-    let mut v_z = v.depth - inverse_z * (dot(shape.rows[0], v_r0) + dot(shape.rows[1], v_r1));
-    // Slopes: of the centre on screen always, of the Jacobian where the limit does not hold.
-    let mut v_sx = k.fx * v_x;
-    let mut v_sy = k.fy * v_y;
-    let (slope_x, slope_y) = (shape.point[0] * inverse_z, shape.point[1] * inverse_z);
-    if shape.free[0] {
-        v_sx += -gx * dot(shape.shape[2], v_r0);
-    }
-    if shape.free[1] {
-        v_sy += -gy * dot(shape.shape[2], v_r1);
-    }
-    v_z += -(v_sx * slope_x + v_sy * slope_y) * inverse_z;
-    let v_point = [v_sx * inverse_z, v_sy * inverse_z, v_z];
+    let k = &camera.k;
+    let v_point = match camera.model {
+        CameraModel::Pinhole => {
+            let inverse_z = T::ONE / shape.point[2];
+            let mut v_z = v.depth - inverse_z * (dot(shape.rows[0], v_r0) + dot(shape.rows[1], v_r1));
+            // Slopes: of the centre on screen always, of the Jacobian where the limit does not hold.
+            let mut v_sx = k.fx * v_x;
+            let mut v_sy = k.fy * v_y;
+            let (slope_x, slope_y) = (shape.point[0] * inverse_z, shape.point[1] * inverse_z);
+            if shape.free[0] {
+                v_sx += -gx * dot(shape.shape[2], v_r0);
+            }
+            if shape.free[1] {
+                v_sy += -gy * dot(shape.shape[2], v_r1);
+            }
+            v_z += -(v_sx * slope_x + v_sy * slope_y) * inverse_z;
+            [v_sx * inverse_z, v_sy * inverse_z, v_z]
+        }
+        CameraModel::Orthographic => [k.fx * v_x, k.fy * v_y, v.depth],
+    };
 
     // shape = R · axes · diag(scale)
     let columns =

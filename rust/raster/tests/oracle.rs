@@ -2,8 +2,8 @@
 
 mod support;
 
-use bigs_raster::{Camera, GaussianGrads, RasterSettings, RenderMode, Renderer};
-use support::{Random, Scene, VIEWMAT, camera, naive, relative};
+use bigs_raster::{Camera, CameraModel, GaussianGrads, RasterSettings, RenderMode, Renderer};
+use support::{Random, Scene, VIEWMAT, camera, naive, naive_with, relative};
 
 #[test]
 fn images_match_the_naive_renderer() {
@@ -41,6 +41,19 @@ fn images_match_the_naive_renderer() {
             assert!(relative(&frame.alphas, &alphas) < 1e-12);
         }
     }
+}
+
+#[test]
+fn orthographic_images_match_the_naive_renderer() {
+    let scene = Scene::<f64>::random(200, 3, 9);
+    let settings = RasterSettings::default();
+    let model = CameraModel::Orthographic;
+    let (colors, alphas) = naive_with(model, &scene, VIEWMAT, 64, 48, &settings);
+    let camera = camera(VIEWMAT, 64, 48).with_model(model);
+    let renderer = Renderer::new(&settings, RenderMode::Rgb).unwrap();
+    let frame = renderer.render(&scene.view(), &camera, None).unwrap();
+    assert!(relative(&frame.colors, &colors) < 1e-12);
+    assert!(relative(&frame.alphas, &alphas) < 1e-12);
 }
 
 #[test]
@@ -126,10 +139,13 @@ fn flat(grads: &GaussianGrads<f64>) -> Vec<f64> {
 
 #[test]
 fn gradients_are_finite_differences() {
-    for (mode, antialiased) in [
-        (RenderMode::Rgb, false),
-        (RenderMode::RgbDepth, true),
-        (RenderMode::RgbExpectedDepth, false),
+    let (pinhole, ortho) = (CameraModel::Pinhole, CameraModel::Orthographic);
+    for (mode, antialiased, model) in [
+        (RenderMode::Rgb, false, pinhole),
+        (RenderMode::RgbDepth, true, pinhole),
+        (RenderMode::RgbExpectedDepth, false, pinhole),
+        (RenderMode::Rgb, false, ortho),
+        (RenderMode::RgbDepth, true, ortho),
     ] {
         // Away from cliffs: every pair counts and no pixel stops.
         let settings = RasterSettings {
@@ -153,14 +169,14 @@ fn gradients_are_finite_differences() {
             .collect();
         let v_alphas: Vec<f64> = (0..width * height).map(|_| r.uniform(-1.0, 1.0)).collect();
         let loss = |scene: &Scene<f64>, viewmat, background: [f64; 3]| {
-            let camera: Camera<f64> = camera(viewmat, width, height);
+            let camera: Camera<f64> = camera(viewmat, width, height).with_model(model);
             let frame = renderer
                 .render(&scene.view(), &camera, Some(&background))
                 .unwrap();
             let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
             dot(&frame.colors, &v_colors) + dot(&frame.alphas, &v_alphas)
         };
-        let camera = camera(VIEWMAT, width, height);
+        let camera = camera(VIEWMAT, width, height).with_model(model);
         let frame = renderer
             .render(&scene.view(), &camera, Some(&background))
             .unwrap();

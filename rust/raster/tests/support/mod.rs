@@ -1,7 +1,7 @@
 //! Scenes and a naive renderer for the integration tests.
 #![allow(dead_code, unreachable_pub)]
 
-use bigs_raster::{Camera, Gaussians, Intrinsics, RasterSettings, Real};
+use bigs_raster::{Camera, CameraModel, Gaussians, Intrinsics, RasterSettings, Real};
 
 /// xorshift64*: random numbers without a dependency.
 pub struct Random(u64);
@@ -93,6 +93,18 @@ pub fn naive(
     height: usize,
     settings: &RasterSettings,
 ) -> (Vec<f64>, Vec<f64>) {
+    naive_with(CameraModel::Pinhole, scene, viewmat, width, height, settings)
+}
+
+/// The same through either kind of camera.
+pub fn naive_with(
+    model: CameraModel,
+    scene: &Scene<f64>,
+    viewmat: [[f64; 4]; 4],
+    width: usize,
+    height: usize,
+    settings: &RasterSettings,
+) -> (Vec<f64>, Vec<f64>) {
     let [fx, fy, cx, cy] = intrinsics(width, height);
     struct Flat {
         centre: [f64; 2],
@@ -129,10 +141,18 @@ pub fn naive(
             let margin = [0.15 * width as f64, 0.15 * height as f64];
             let sx = (p[0] / p[2]).clamp(-(cx + margin[0]) / fx, (width as f64 - cx + margin[0]) / fx);
             let sy = (p[1] / p[2]).clamp(-(cy + margin[1]) / fy, (height as f64 - cy + margin[1]) / fy);
-            let jacobian = [
-                [fx / p[2], 0.0, -fx * sx / p[2]],
-                [0.0, fy / p[2], -fy * sy / p[2]],
-            ];
+            let (centre, jacobian) = match model {
+                CameraModel::Pinhole => (
+                    [fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy],
+                    [
+                        [fx / p[2], 0.0, -fx * sx / p[2]],
+                        [0.0, fy / p[2], -fy * sy / p[2]],
+                    ],
+                ),
+                CameraModel::Orthographic => {
+                    ([fx * p[0] + cx, fy * p[1] + cy], [[fx, 0.0, 0.0], [0.0, fy, 0.0]])
+                }
+            };
             let a: [[f64; 3]; 2] = std::array::from_fn(|row| {
                 std::array::from_fn(|k| {
                     let mut sum = 0.0;
@@ -152,7 +172,7 @@ pub fn naive(
             );
             let det = xx * yy - xy * xy;
             Flat {
-                centre: [fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy],
+                centre,
                 inverse: [yy / det, -xy / det, xx / det],
                 depth: p[2],
                 id,
