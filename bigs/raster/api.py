@@ -62,8 +62,8 @@ def rasterization(
         pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the
             background with alpha 0.
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
-        camera_model: "pinhole", or "ortho" for parallel rays, x = fx X + cx with fx in pixels per metre. Depth is
-            camera z in both, and so are the near and the far plane.
+        camera_model: "pinhole", or "ortho": parallel rays, x = fx X + cx with fx in pixels per metre. Depth
+            is camera z in both, and so are the near and the far plane.
         backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,
             gsplat for CUDA tensors.
 
