@@ -7,7 +7,15 @@ from numpy.typing import NDArray
 
 from bigs.raster.settings import RasterSettings
 
-__all__ = ["RasterState", "__version__", "default_settings", "rasterize_backward", "rasterize_forward"]
+__all__ = [
+    "RasterState",
+    "__version__",
+    "default_settings",
+    "fma_peak_gflops",
+    "rasterize_backward",
+    "rasterize_forward",
+    "simd_level",
+]
 
 __version__: str
 
@@ -61,3 +69,9 @@ def rasterize_backward(
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""
+
+def simd_level() -> str:
+    """The CPU feature level the kernels run at: avx512, avx2, neon or baseline."""
+
+def fma_peak_gflops() -> float:
+    """Measured peak of one thread in 10⁹ float32 operations per second at that level; a multiply-add is two."""

@@ -1,6 +1,7 @@
 //! `bigs._raster`: the Python face of `bigs-raster`. Arrays in, arrays out; no algorithm, default or limit lives here.
 
 mod convert;
+mod measure;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -289,5 +290,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<RasterState>()?;
     m.add_function(wrap_pyfunction!(rasterize_forward, m)?)?;
     m.add_function(wrap_pyfunction!(rasterize_backward, m)?)?;
-    m.add_function(wrap_pyfunction!(default_settings, m)?)
+    m.add_function(wrap_pyfunction!(default_settings, m)?)?;
+    m.add_function(wrap_pyfunction!(measure::simd_level, m)?)?;
+    m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)
 }

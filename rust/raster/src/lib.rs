@@ -49,6 +49,7 @@ mod dispatch;
 mod error;
 mod gaussians;
 mod kernel;
+pub mod peak;
 mod project;
 mod real;
 mod render;
