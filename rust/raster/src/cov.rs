@@ -102,38 +102,80 @@ pub(crate) struct Whitening<T> {
     pub(crate) w11: T,
     pub(crate) w12: T,
     pub(crate) w22: T,
-    /// Variances of Σ along x and y, in px².
-    pub(crate) variances: [T; 2],
+    /// Standard deviations of Σ along x and y, in px.
+    pub(crate) deviations: [T; 2],
     /// √(det A Aᵀ / det Σ): what `antialiased` scales opacity by.
     pub(crate) compensation: T,
+}
+
+/// A and Σ in units that keep a determinant, a fourth power, within range.
+struct Scaled<T> {
+    /// One unit is 1/`unit` pixels.
+    unit: T,
+    r0: Vec3<T>,
+    r1: Vec3<T>,
+    eps: T,
+    /// r₀ × r₁ and its square.
+    n: Vec3<T>,
+    area: T,
+    /// Σ = [[a, b], [b, c]]
+    a: T,
+    b: T,
+    c: T,
+    det: T,
+}
+
+#[inline(always)]
+fn scaled<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Scaled<T> {
+    /// Rows longer than this many pixels are measured in units of themselves.
+    const LONG: f64 = 1e6;
+    let longest = |r: Vec3<T>| r[0].abs().greater(r[1].abs()).greater(r[2].abs());
+    let length = longest(r0).greater(longest(r1));
+    let unit = if length > T::of(LONG) {
+        T::ONE / length
+    } else {
+        T::ONE
+    };
+    let (r0, r1, eps) = (r0.map(|v| v * unit), r1.map(|v| v * unit), eps * unit * unit);
+    let n = cross(r0, r1);
+    let (a0, c0, area) = (dot(r0, r0), dot(r1, r1), dot(n, n));
+    Scaled {
+        unit,
+        r0,
+        r1,
+        eps,
+        n,
+        area,
+        a: a0 + eps,
+        b: dot(r0, r1),
+        c: c0 + eps,
+        det: area + eps * (a0 + c0) + eps * eps,
+    }
 }
 
 /// The whitening of A with rows `r0`, `r1`; `None` if Σ is singular or overflows.
 #[inline(always)]
 pub(crate) fn whiten<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Option<Whitening<T>> {
-    let n = cross(r0, r1);
-    let (a0, c0) = (dot(r0, r0), dot(r1, r1));
-    let (a, b, c) = (a0 + eps, dot(r0, r1), c0 + eps);
-    let area = dot(n, n);
-    let det = area + eps * (a0 + c0) + eps * eps;
-    if !(det >= T::TINY && det.is_finite()) {
+    let s = scaled(r0, r1, eps);
+    if !(s.det >= T::TINY && s.det.is_finite()) {
         return None;
     }
-    let scale = T::of(EXP2_SCALE);
-    let w11 = scale * (c / det).sqrt();
+    let scale = T::of(EXP2_SCALE) * s.unit;
+    let w11 = scale * (s.c / s.det).sqrt();
     Some(Whitening {
         w11,
-        w12: -w11 * (b / c),
-        w22: scale / c.sqrt(),
-        variances: [a, c],
-        compensation: (area / det).sqrt(),
+        w12: -w11 * (s.b / s.c),
+        w22: scale / s.c.sqrt(),
+        deviations: [s.a.sqrt() / s.unit, s.c.sqrt() / s.unit],
+        compensation: (s.area / s.det).sqrt(),
     })
 }
 
 /// Gradients of the rows of A.
 ///
-/// `moments` are Σ v_e·uu, Σ v_e·uv, Σ v_e·vv over pixels, where v_e is the gradient of the exponent of two; in
-/// whitened coordinates the gradient of Σ is (1/κ²) Wᵀ · moments · W with κ = √(½ log₂ e), free of cancellation.
+/// `moments` are Σ v_e·uu, Σ v_e·uv, Σ v_e·vv over pixels, where v_e is the gradient of the exponent of two. In
+/// whitened coordinates the gradient of A is (2/κ²) Wᵀ · moments · P with P = W A and κ = √(½ log₂ e). Along a needle
+/// the rows of A nearly cancel in P, so its first row is taken from c r₀ − b r₁ = r₁ × (r₀ × r₁) + ε r₀.
 #[inline(always)]
 pub(crate) fn whiten_vjp<T: Real>(
     r0: Vec3<T>,
@@ -143,31 +185,31 @@ pub(crate) fn whiten_vjp<T: Real>(
     moments: [T; 3],
     v_compensation: T,
 ) -> (Vec3<T>, Vec3<T>) {
+    let s = scaled(r0, r1, eps);
     let two = T::ONE + T::ONE;
-    let inverse = T::of(1.0 / (EXP2_SCALE * EXP2_SCALE));
+    let gain = T::of(2.0 / (EXP2_SCALE * EXP2_SCALE));
     let [uu, uv, vv] = moments;
-    let v_a = inverse * w.w11 * w.w11 * uu;
-    let v_b = inverse * w.w11 * (w.w12 * uu + w.w22 * uv);
-    let v_c = inverse * (w.w12 * (w.w12 * uu + two * w.w22 * uv) + w.w22 * w.w22 * vv);
-    let mut v_r0 = [0, 1, 2].map(|i| two * (v_a * r0[i] + v_b * r1[i]));
-    let mut v_r1 = [0, 1, 2].map(|i| two * (v_b * r0[i] + v_c * r1[i]));
+    let across = cross(s.r1, s.n);
+    let along = w.w11 / s.unit / s.c;
+    let p0 = [0, 1, 2].map(|i| along * (across[i] + s.eps * s.r0[i]));
+    let p1 = s.r1.map(|r| w.w22 / s.unit * r);
+    let g0 = [0, 1, 2].map(|i| gain * (uu * p0[i] + uv * p1[i]));
+    let g1 = [0, 1, 2].map(|i| gain * (uv * p0[i] + vv * p1[i]));
+    let mut v_r0 = g0.map(|g| w.w11 * g);
+    let mut v_r1 = [0, 1, 2].map(|i| w.w12 * g0[i] + w.w22 * g1[i]);
     if v_compensation != T::ZERO {
         // compensation = |n| / √det with n = r₀ × r₁
-        let n = cross(r0, r1);
-        let area = dot(n, n);
-        let (a0, c0) = (dot(r0, r0), dot(r1, r1));
-        let det = area + eps * (a0 + c0) + eps * eps;
-        let v_det = -v_compensation * w.compensation / (two * det);
-        let along = if area >= T::TINY {
-            v_compensation / (area * det).sqrt()
+        let v_det = -v_compensation * w.compensation / (two * s.det);
+        let outward = if s.area >= T::TINY {
+            v_compensation / (s.area * s.det).sqrt()
         } else {
             T::ZERO
         };
-        let v_n = n.map(|x| x * (along + two * v_det));
-        let (from_r0, from_r1) = (cross(r1, v_n), cross(v_n, r0));
+        let v_n = s.n.map(|x| x * (outward + two * v_det));
+        let (from_r0, from_r1) = (cross(s.r1, v_n), cross(v_n, s.r0));
         for i in 0..3 {
-            v_r0[i] += from_r0[i] + two * eps * v_det * r0[i];
-            v_r1[i] += from_r1[i] + two * eps * v_det * r1[i];
+            v_r0[i] += s.unit * (from_r0[i] + two * s.eps * v_det * s.r0[i]);
+            v_r1[i] += s.unit * (from_r1[i] + two * s.eps * v_det * s.r1[i]);
         }
     }
     (v_r0, v_r1)
@@ -247,9 +289,17 @@ mod tests {
     }
 
     #[test]
+    fn determinants_beyond_the_range_of_numbers_are_no_obstacle() {
+        let w = whiten([3e15f32, 0.0, 0.0], [0.0, 1e15, 0.0], 0.3).unwrap();
+        assert!((f64::from(w.w11) * 3e15 / EXP2_SCALE - 1.0).abs() < 1e-6);
+        assert!((f64::from(w.w22) * 1e15 / EXP2_SCALE - 1.0).abs() < 1e-6);
+        assert!((w.deviations[0] / 3e15 - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
     fn hopeless_covariances_are_refused() {
         assert!(whiten([0.0f32; 3], [0.0; 3], 0.0).is_none());
-        assert!(whiten([1e30f32, 0.0, 0.0], [0.0, 1e30, 0.0], 0.3).is_none());
+        assert!(whiten([1e-20f32, 0.0, 0.0], [0.0, 1e-20, 0.0], 0.0).is_none());
         assert_eq!(normalize_quat([0.0f32; 4]), ([0.0; 4], 0.0));
         assert_eq!(normalize_quat([1e-30f32, 0.0, 0.0, 0.0]).0, [1.0, 0.0, 0.0, 0.0]);
     }

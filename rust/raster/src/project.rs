@@ -165,7 +165,9 @@ fn splat<T: Real>(
         T::of(f64::INFINITY)
     };
     let two_ln_2 = T::of(2.0 * std::f64::consts::LN_2);
-    let radius = w.variances.map(|variance| (two_ln_2 * reach * variance).sqrt());
+    let radius = w
+        .deviations
+        .map(|deviation| (two_ln_2 * reach).sqrt() * deviation);
     let (width, height) = (T::of(camera.width as f64), T::of(camera.height as f64));
     let on_screen =
         x + radius[0] > T::ZERO && x - radius[0] < width && y + radius[1] > T::ZERO && y - radius[1] < height;
