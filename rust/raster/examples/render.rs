@@ -20,7 +20,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use bigs_raster::{RasterSettings, RenderMode, Renderer};
+use bigs_raster::{CameraModel, RasterSettings, RenderMode, Renderer};
 use lexopt::prelude::*;
 
 use orbit::{Axis, Orbit};
@@ -44,6 +44,7 @@ Usage: render [scene.ply] [options]
   --zoom FACTOR         nearer than the distance that shows nearly all Gaussians, 1 by default
   --centre X,Y,Z        what to look at; the middle of the scene by default
   --background R,G,B    from 0 to 1, or one number for grey; 1 by default
+  --orthographic        no perspective
   --antialiased         compensate thin Gaussians for what the pixel grid adds to them
   --save-ply PATH       also write the scene as a PLY file
 ";
@@ -62,6 +63,7 @@ struct Options {
     zoom: f32,
     centre: Option<[f32; 3]>,
     background: [f32; 3],
+    model: CameraModel,
     antialiased: bool,
     save_ply: Option<PathBuf>,
     detail: f32,
@@ -82,6 +84,7 @@ impl Default for Options {
             zoom: 1.0,
             centre: None,
             background: [1.0; 3],
+            model: CameraModel::Pinhole,
             antialiased: false,
             save_ply: None,
             detail: 1.0,
@@ -134,6 +137,7 @@ impl Options {
                 Long("zoom") => options.zoom = parser.value()?.parse()?,
                 Long("centre" | "center") => options.centre = Some(parser.value()?.parse_with(triple)?),
                 Long("background") => options.background = parser.value()?.parse_with(triple)?,
+                Long("orthographic") => options.model = CameraModel::Orthographic,
                 Long("antialiased") => options.antialiased = true,
                 Long("save-ply") => options.save_ply = Some(parser.value()?.into()),
                 Long("detail") => options.detail = parser.value()?.parse()?,
@@ -207,7 +211,7 @@ where
         let colors = splats.colors();
         let gaussians = splats.view(&colors).map_err(|e| e.to_string())?;
         let camera = orbit
-            .camera(options.fov, width, height)
+            .camera(options.model, options.fov, width, height)
             .map_err(|e| e.to_string())?;
         let image = renderer
             .render(&gaussians, &camera, Some(&options.background))

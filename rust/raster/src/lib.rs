@@ -36,10 +36,49 @@
 //! # Ok::<(), bigs_raster::RasterError>(())
 //! ```
 //!
-//! The stages are modules: project, sort, bin into tiles, composite. [`Batch`] renders many views that share some of
-//! their inputs; [`Renderer`] renders one. Threads are rayon's: `RAYON_NUM_THREADS` or an installed pool.
+//! # Gradients
+//!
+//! [`Renderer::render_vjp`] takes what [`Renderer::render`] took, the frame it made, and the gradients of a loss with
+//! respect to the frame's colours and alphas; it returns those with respect to every input ([`GaussianGrads`]). They
+//! are those of the formulas: a pair of pixel and Gaussian that is clamped, below the alpha threshold or behind the
+//! point where a pixel stops passes none. `examples/fit_image.rs` is a whole optimisation.
+//!
+//! # Many views
+//!
+//! [`Batch`] renders entries × cameras at once. An input may be shared along either axis ([`Slabs`]): its gradient is
+//! then the sum over the views that share it. [`Wanted`] leaves out gradients that nobody needs,
+//! [`BatchInputs::pixel_mask`] pixels that nobody looks at.
+//!
+//! # Threads and reproducibility
+//!
+//! Threads are rayon's: `RAYON_NUM_THREADS`, or a call inside `ThreadPool::install`. Every sum has a fixed order, so
+//! results are the same bits for any number of threads and on every run of one machine. Machines with other vector
+//! instructions round differently, in the last bits.
+//!
+//! # CPU features
+//!
+//! Kernels for AVX-512, AVX2 with FMA, NEON and the baseline of the target are compiled in, whatever the flags of the
+//! build; the best that the CPU has is picked on first use. [`peak::simd_level`] tells which. The environment variable
+//! `BIGS_RASTER_SIMD` (`avx512`, `avx2`, `neon`, `baseline`) lowers the choice.
+//!
+//! # Errors
+//!
+//! What a caller can get wrong is a [`RasterError`] that names the input and what was expected. Arrays are checked once,
+//! in [`Gaussians::new`], [`Camera::new`] and [`Batch::new`]; nothing panics on their values.
 
 #![deny(unsafe_code)]
+// A caller's mistake is an error, never a panic. Tests may unwrap.
+#![cfg_attr(
+    not(test),
+    warn(
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::todo,
+        clippy::unimplemented,
+        clippy::undocumented_unsafe_blocks
+    )
+)]
 
 mod batch;
 mod camera;
@@ -68,3 +107,8 @@ pub use real::{Arithmetic, Real};
 pub use render::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};
 pub use sort::{RadixKey, radix_sort};
+
+/// The README's code is compiled and run with the documentation's.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -124,9 +124,13 @@ fn the_built_in_scene_survives_a_file() {
 fn text_files_with_extra_properties_are_read_and_the_right_way_up() {
     let ply = write_ascii("three.ply", &PROPERTIES, &ROWS);
     let out = temporary("three.png");
-    for (up, upper) in [("-y", [255, 0, 0]), ("y", [0, 0, 255])] {
+    for (up, upper, model) in [
+        ("-y", [255, 0, 0], "--antialiased"),
+        ("y", [0, 0, 255], "--orthographic"),
+    ] {
         let arguments = [
             &ply,
+            model,
             "--up",
             up,
             "--out",

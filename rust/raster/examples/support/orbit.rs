@@ -1,6 +1,6 @@
 //! Cameras that look at a point from around it.
 
-use bigs_raster::{Camera, Intrinsics, RasterError};
+use bigs_raster::{Camera, CameraModel, Intrinsics, RasterError};
 
 /// A direction along an axis of the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,8 +53,15 @@ impl Orbit {
         [0, 1, 2].map(|k| self.centre[k] + self.distance * out[k])
     }
 
-    /// The camera, with its vertical field of view in degrees and the principal point in the middle.
-    pub(crate) fn camera(&self, fov: f32, width: usize, height: usize) -> Result<Camera<f32>, RasterError> {
+    /// The camera, with its vertical field of view in degrees and the principal point in the middle. An orthographic
+    /// one shows what a pinhole camera would at the distance of the centre.
+    pub(crate) fn camera(
+        &self,
+        model: CameraModel,
+        fov: f32,
+        width: usize,
+        height: usize,
+    ) -> Result<Camera<f32>, RasterError> {
         let (sin_azimuth, cos_azimuth) = self.azimuth.to_radians().sin_cos();
         let (sin_elevation, cos_elevation) = self.elevation.to_radians().sin_cos();
         let forward = self.world([
@@ -75,12 +82,16 @@ impl Orbit {
         };
         let viewmat = [row(right), row(down), row(forward), [0.0, 0.0, 0.0, 1.0]];
         let focal = height as f32 / 2.0 / (fov.to_radians() / 2.0).tan();
+        let scale = match model {
+            CameraModel::Pinhole => focal,
+            CameraModel::Orthographic => focal / self.distance,
+        };
         let k = Intrinsics {
-            fx: focal,
-            fy: focal,
+            fx: scale,
+            fy: scale,
             cx: width as f32 / 2.0,
             cy: height as f32 / 2.0,
         };
-        Camera::new(viewmat, k, width, height)
+        Ok(Camera::new(viewmat, k, width, height)?.with_model(model))
     }
 }
