@@ -12,6 +12,8 @@ __all__ = [
     "__version__",
     "default_settings",
     "fma_peak_gflops",
+    "harmonics_backward",
+    "harmonics_forward",
     "rasterize_backward",
     "rasterize_forward",
     "simd_level",
@@ -66,6 +68,17 @@ def rasterize_backward(
     NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int
 ]:
     """Flat gradients of the seven differentiable inputs and the number of tiles without incoming gradient."""
+
+# dirs [.., N, 3], coeffs [N, K, 3], mask [.., N] of bool or None: all Gaussians of one place, then the next.
+_HarmonicsArrays = tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]
+
+def harmonics_forward(degree: int, arrays: _HarmonicsArrays) -> NDArray[Any]:
+    """Colours of the directions, flat."""
+
+def harmonics_backward(
+    degree: int, arrays: _HarmonicsArrays, v_colors: NDArray[Any], wanted: list[bool]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Flat gradients of dirs and coeffs; what is not wanted is an empty array."""
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

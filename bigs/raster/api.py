@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from bigs.checks import InputError, check_choice, check_finite, check_shape
-from bigs.raster import cuda, reference, rust
+from bigs.raster import cuda, reference, rust, sh
 from bigs.raster.settings import RasterSettings
 from bigs.types import RenderOutput
 
@@ -26,7 +26,7 @@ def rasterization(
     quats: torch.Tensor,  # [..., N, 4]
     scales: torch.Tensor,  # [..., N, 3]
     opacities: torch.Tensor,  # [..., N]
-    colors: torch.Tensor,  # [..., N, D] or [..., C, N, D]
+    colors: torch.Tensor,  # [..., (C,) N, D], or [..., (C,) N, K, 3] with sh_degree
     viewmats: torch.Tensor,  # [..., C, 4, 4]
     Ks: torch.Tensor,  # [..., C, 3, 3]
     width: int,
@@ -35,6 +35,7 @@ def rasterization(
     settings: RasterSettings | None = None,
     backgrounds: torch.Tensor | None = None,  # [..., C, D]
     pixel_mask: torch.Tensor | None = None,  # [..., C, H, W]
+    sh_degree: int | None = None,
     render_mode: RenderMode = "RGB",
     camera_model: CameraModel = "pinhole",
     backend: Backend = "auto",
@@ -52,7 +53,8 @@ def rasterization(
         quats: rotations w x y z, of any length; the zero quaternion is no rotation.
         scales: standard deviations along the rotated axes, metres.
         opacities: in [0, 1].
-        colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too.
+        colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too. With `sh_degree` the
+            coefficients of spherical harmonics, and D is 3.
         viewmats: world to camera, OpenCV axes; the 3×3 part must be invertible.
         Ks: camera matrices in pixels without skew; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
         width: of the images, pixels.
@@ -61,6 +63,8 @@ def rasterization(
         backgrounds: the colour behind everything; black by default. Depth has none.
         pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the
             background with alpha 0.
+        sh_degree: 0 to 3: colours depend on the direction from camera to Gaussian, with signs and order of the
+            basis, the added 0.5 and the limit at 0 as in 3D Gaussian splatting. None: they do not.
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
         camera_model: "pinhole", or "ortho": parallel rays, x = fx X + cx with fx in pixels per metre. Depth
             is camera z in both, and so are the near and the far plane.
@@ -91,23 +95,42 @@ def rasterization(
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
     _check_kind(tensors, pixel_mask)
-    batch = _batch_of(tensors, pixel_mask, width, height)
+    if sh_degree is not None:
+        check_choice("sh_degree", sh_degree, sh.DEGREES)
+        sh.check_coefficients("colors", sh_degree, colors)
+    batch = _batch_of(tensors, pixel_mask, width, height, sh_degree)
     _check_cameras(viewmats, Ks)
     if backend == "auto":
         backend = "gsplat" if means.is_cuda else "rust"
     if backend == "rust":
         if means.is_cuda:
             raise InputError("means: expected CPU tensors for backend 'rust', found a CUDA tensor")
-        return _render_rust(tensors, pixel_mask, batch, settings, render_mode, camera_model)
+        try:
+            return _render_rust(
+                *_with_view_colors(tensors, batch, sh.spherical_harmonics),
+                pixel_mask,
+                settings,
+                render_mode,
+                camera_model,
+            )
+        except ValueError as error:
+            # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
+            for name, tensor in tensors.items():
+                check_finite(name, tensor)
+            raise InputError(str(error)) from None
     for name, tensor in tensors.items():
         check_finite(name, tensor)
     expanded = _expanded(tensors, batch)
     mask = None if pixel_mask is None else pixel_mask.expand(*batch.shape, *pixel_mask.shape[-3:])
     if backend == "gsplat":
         return RenderOutput(
-            *cuda.rasterize(expanded, mask, batch.width, batch.height, settings, render_mode, camera_model)
+            *cuda.rasterize(
+                expanded, mask, batch.width, batch.height, settings, render_mode, camera_model, sh_degree
+            )
         )
-    return _render_torch(expanded, mask, batch, settings, render_mode, camera_model)
+    return _render_torch(
+        *_with_view_colors(expanded, batch, reference.harmonics), mask, settings, render_mode, camera_model
+    )
 
 
 class _Batch(NamedTuple):
@@ -118,6 +141,7 @@ class _Batch(NamedTuple):
     width: int
     height: int
     colors_per_camera: bool
+    sh_degree: int | None
 
 
 def _check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None) -> None:
@@ -142,7 +166,11 @@ def _check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | Non
 
 
 def _batch_of(
-    tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None, width: int, height: int
+    tensors: dict[str, torch.Tensor],
+    pixel_mask: torch.Tensor | None,
+    width: int,
+    height: int,
+    sh_degree: int | None,
 ) -> _Batch:
     for name, size in (("width", width), ("height", height)):
         if not isinstance(size, int | np.integer) or size < 1:
@@ -154,12 +182,13 @@ def _batch_of(
     if channels == 0 or cameras == 0:
         name, what = ("colors", "channel") if channels == 0 else ("viewmats", "camera")
         raise InputError(f"{name}: expected at least one {what}, found shape {list(tensors[name].shape)}")
+    color = (channels,) if sh_degree is None else tuple(tensors["colors"].shape[-2:])
     trailing: dict[str, tuple[int, ...]] = {
         "means": (n, 3),
         "quats": (n, 4),
         "scales": (n, 3),
         "opacities": (n,),
-        "colors": (n, channels),
+        "colors": (n, *color),
         "viewmats": (cameras, 4, 4),
         "Ks": (cameras, 3, 3),
         "backgrounds": (cameras, channels),
@@ -176,7 +205,7 @@ def _batch_of(
     depth = max(len(axes) for name, axes in leading.items() if name != "colors")
     colors_per_camera = len(leading["colors"]) == depth + 1
     if colors_per_camera:
-        check_shape("colors", tensors["colors"], [None] * depth + [cameras, n, channels])
+        check_shape("colors", tensors["colors"], [None] * depth + [cameras, n, *color])
         leading["colors"] = leading["colors"][:-1]
     try:
         shape = torch.broadcast_shapes(*leading.values())
@@ -185,7 +214,7 @@ def _batch_of(
         raise InputError(f"batch axes: expected shapes that broadcast, found {found}") from None
     if 0 in shape:
         raise InputError(f"batch axes: expected at least one entry, found {list(shape)}")
-    return _Batch(tuple(shape), cameras, int(width), int(height), colors_per_camera)
+    return _Batch(tuple(shape), cameras, int(width), int(height), colors_per_camera, sh_degree)
 
 
 def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
@@ -208,6 +237,23 @@ def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
             raise InputError(f"{name}: expected {expected}, found {found} at index {list(index)}")
 
 
+def _with_view_colors(
+    tensors: dict[str, torch.Tensor], batch: _Batch, evaluate: sh.Evaluate
+) -> tuple[dict[str, torch.Tensor], _Batch]:
+    """The inputs with plain colours: what each camera sees, where the colours are harmonics."""
+    if batch.sh_degree is None:
+        return tensors, batch
+    colors = sh.view_colors(
+        evaluate,
+        batch.sh_degree,
+        tensors["means"],
+        tensors["colors"],
+        tensors["viewmats"],
+        batch.colors_per_camera,
+    )
+    return {**tensors, "colors": colors}, batch._replace(colors_per_camera=True, sh_degree=None)
+
+
 def _slabs(tensor: torch.Tensor, batch: tuple[int, ...], axes: int, camera_axis: bool) -> torch.Tensor:
     """The tensor as [entries or 1, cameras or 1, ...]; `axes` counts its own axes without the camera's."""
     lead = tuple(tensor.shape[: tensor.ndim - axes - camera_axis])
@@ -220,8 +266,8 @@ def _slabs(tensor: torch.Tensor, batch: tuple[int, ...], axes: int, camera_axis:
 
 def _render_rust(
     tensors: dict[str, torch.Tensor],
-    pixel_mask: torch.Tensor | None,
     batch: _Batch,
+    pixel_mask: torch.Tensor | None,
     settings: RasterSettings,
     render_mode: RenderMode,
     camera_model: CameraModel,
@@ -239,22 +285,9 @@ def _render_rust(
         slabs("backgrounds", 1, True) if "backgrounds" in tensors else None,
     )
     mask = None if pixel_mask is None else _slabs(pixel_mask, batch.shape, 2, True)
-    try:
-        colors, alphas, info = rust.rasterize(
-            inputs,
-            slabs("Ks", 2, True),
-            mask,
-            batch.width,
-            batch.height,
-            settings,
-            render_mode,
-            camera_model,
-        )
-    except ValueError as error:
-        # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
-        for name, tensor in tensors.items():
-            check_finite(name, tensor)
-        raise InputError(str(error)) from None
+    colors, alphas, info = rust.rasterize(
+        inputs, slabs("Ks", 2, True), mask, batch.width, batch.height, settings, render_mode, camera_model
+    )
     lead = (*batch.shape, batch.cameras)
     for name in ("means2d", "depths", "radii"):
         info[name] = info[name].reshape(*lead, *info[name].shape[1:])
@@ -265,7 +298,12 @@ def _render_rust(
 
 def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torch.Tensor]:
     """All inputs with all batch axes."""
-    axes = {"opacities": 1, "viewmats": 3, "Ks": 3, "colors": 2 + batch.colors_per_camera}
+    axes = {
+        "opacities": 1,
+        "viewmats": 3,
+        "Ks": 3,
+        "colors": 2 + batch.colors_per_camera + (batch.sh_degree is not None),
+    }
     return {
         name: x.expand(*batch.shape, *x.shape[x.ndim - axes.get(name, 2) :]) for name, x in tensors.items()
     }
@@ -273,8 +311,8 @@ def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torc
 
 def _render_torch(
     tensors: dict[str, torch.Tensor],
-    pixel_mask: torch.Tensor | None,
     batch: _Batch,
+    pixel_mask: torch.Tensor | None,
     settings: RasterSettings,
     render_mode: RenderMode,
     camera_model: CameraModel,

@@ -34,6 +34,7 @@ def rasterize(
     settings: RasterSettings,
     render_mode: str,
     camera_model: str,
+    sh_degree: int | None,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render checked inputs with equal batch axes, by the names of `bigs.raster.rasterization`.
 
@@ -62,6 +63,7 @@ def rasterize(
         rasterize_mode="antialiased" if settings.antialiased else "classic",
         render_mode=render_mode,
         camera_model=camera_model,
+        sh_degree=sh_degree,
         packed=False,
     )
     if pixel_mask is not None:

@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from numpy.polynomial import Legendre, Polynomial
 
 from bigs.raster.settings import RasterSettings
 
@@ -183,3 +184,31 @@ def _composite(
     after = torch.cumprod(1 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after], dim=0)
     return (alphas * before[:-1]).T @ values, before[-1]
+
+
+def harmonics(degree: int, dirs: torch.Tensor, coeffs: torch.Tensor) -> torch.Tensor:
+    """Real spherical harmonics [..., 3] of coefficients [..., K, 3] along directions [..., 3] of any length.
+
+    From the general formula: order m has cos or sin of |m| times the azimuth, an associated Legendre function
+    of z with the Condon-Shortley phase, and a factor that makes the integral of its square 1.
+    """
+    unit = torch.nn.functional.normalize(dirs, dim=-1)
+    x, y, z = unit.unbind(-1)
+    rim = torch.complex(x, y)  # sin(polar angle) · exp(i · azimuth), smooth at the poles too
+    colors = torch.zeros_like(dirs)
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            m = abs(order)
+            # Rodrigues: the m-th derivative of the Legendre polynomial of this band, a polynomial in z.
+            polynomial = Legendre.basis(band).deriv(m) if m else Legendre.basis(band)
+            powers = polynomial.convert(kind=Polynomial).coef
+            along = sum(float(c) * z**p for p, c in enumerate(powers))
+            scale = math.sqrt(
+                (2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m)
+            )
+            around = torch.ones_like(z)
+            if m:
+                spun = rim**m
+                around = (-1) ** m * math.sqrt(2) * (spun.real if order > 0 else spun.imag)
+            colors = colors + (scale * along * around)[..., None] * coeffs[..., band * band + band + order, :]
+    return colors

@@ -152,7 +152,8 @@ class FakeGsplat:
 def test_gsplat_receives_the_call(monkeypatch):
     monkeypatch.setattr("bigs.raster.cuda._gsplat", FakeGsplat)
     inputs = without_perspective(scene(n=30, batch=(2,)))
-    inputs["colors"] = inputs["colors"][0]
+    inputs["colors"] = torch.rand(30, 9, 3, generator=torch.Generator().manual_seed(2)).double()
+    inputs["sh_degree"] = 2
     mask = torch.rand(2, 1, 18, 23) < 0.5
     settings = RasterSettings(antialiased=True, radius_clip=2.0)
     call = {**inputs, "pixel_mask": mask, "settings": settings, "render_mode": "RGB+D"}

@@ -2,6 +2,7 @@
 
 mod convert;
 mod measure;
+mod sh;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -292,5 +293,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(rasterize_backward, m)?)?;
     m.add_function(wrap_pyfunction!(default_settings, m)?)?;
     m.add_function(wrap_pyfunction!(measure::simd_level, m)?)?;
+    m.add_function(wrap_pyfunction!(sh::harmonics_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)
 }

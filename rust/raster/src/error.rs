@@ -33,6 +33,13 @@ pub enum RasterError {
         /// The range that is accepted.
         expected: &'static str,
     },
+    /// Spherical harmonics of a degree that the engine or the coefficients do not have.
+    BadDegree {
+        /// The degree asked for.
+        degree: usize,
+        /// Basis functions that there are coefficients for.
+        bases: usize,
+    },
     /// More Gaussian-tile intersections than a 32-bit index can number.
     TooManyIntersections,
 }
@@ -52,6 +59,12 @@ impl fmt::Display for RasterError {
             Self::BadCamera { reason } => write!(f, "camera: {reason}"),
             Self::BadSetting { name, expected } => {
                 write!(f, "settings.{name}: expected {expected}")
+            }
+            Self::BadDegree { degree, bases } => {
+                write!(
+                    f,
+                    "sh_degree: expected at most 3 and (degree + 1)² of the {bases} bases, found {degree}"
+                )
             }
             Self::TooManyIntersections => {
                 write!(

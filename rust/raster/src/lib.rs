@@ -93,6 +93,7 @@ mod project;
 mod real;
 mod render;
 mod settings;
+mod sh;
 mod sort;
 pub mod stages;
 mod tiles;
@@ -106,6 +107,7 @@ pub use gaussians::Gaussians;
 pub use real::{Arithmetic, Real};
 pub use render::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};
+pub use sh::{Harmonics, HarmonicsGradients};
 pub use sort::{RadixKey, radix_sort};
 
 /// The README's code is compiled and run with the documentation's.

@@ -1,0 +1,105 @@
+//! Spherical harmonics: the Python face of `bigs_raster::Harmonics`.
+
+use bigs_raster::{Harmonics, Real};
+use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyTuple;
+
+use crate::convert::{gradient, slice};
+use crate::run;
+
+/// The arrays of a call, borrowed for as long as this lives.
+struct Arrays<'py, T: Element> {
+    dirs: PyReadonlyArrayDyn<'py, T>,
+    coefficients: PyReadonlyArrayDyn<'py, T>,
+    mask: Option<PyReadonlyArrayDyn<'py, bool>>,
+}
+
+impl<'py, T: Real + Element> Arrays<'py, T> {
+    /// Reads (dirs, coefficients, mask | None).
+    fn extract(arrays: &Bound<'py, PyTuple>) -> PyResult<Self> {
+        let mask = arrays.get_item(2)?;
+        Ok(Self {
+            dirs: slice("dirs", &arrays.get_item(0)?)?,
+            coefficients: slice("coeffs", &arrays.get_item(1)?)?,
+            mask: (!mask.is_none()).then(|| slice("masks", &mask)).transpose()?,
+        })
+    }
+
+    fn harmonics(&self, degree: usize) -> PyResult<Harmonics<'_, T>> {
+        let shape = self.coefficients.shape();
+        if shape.len() < 2 {
+            return Err(PyValueError::new_err(format!(
+                "coeffs: expected axes for bases and colours, found shape {shape:?}"
+            )));
+        }
+        let mask = self.mask.as_ref().map(|mask| mask.as_slice()).transpose()?;
+        let dirs = self.dirs.as_slice()?.as_chunks().0;
+        Harmonics::new(
+            degree,
+            shape[shape.len() - 2],
+            dirs,
+            self.coefficients.as_slice()?,
+            mask,
+        )
+        .map_err(crate::value_error)
+    }
+}
+
+fn forward<'py, T: Real + Element>(
+    py: Python<'py>,
+    degree: usize,
+    arrays: &Arrays<'py, T>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let harmonics = arrays.harmonics(degree)?;
+    let colors = run(py, || Ok(harmonics.evaluate()))?;
+    Ok(gradient(py, colors.into_flattened()).into_any())
+}
+
+/// Colours of the directions, flat. `arrays` is (dirs `[.., N, 3]`, coeffs `[N, K, 3]`, mask `[.., N]` or None),
+/// C-contiguous, float32 or float64 throughout; all Gaussians of one place, then all of the next. Raises ValueError.
+#[pyfunction]
+pub(crate) fn harmonics_forward<'py>(
+    py: Python<'py>,
+    degree: usize,
+    arrays: &Bound<'py, PyTuple>,
+) -> PyResult<Bound<'py, PyAny>> {
+    match Arrays::<f32>::extract(arrays) {
+        Ok(single) => forward(py, degree, &single),
+        Err(_) => forward(py, degree, &Arrays::<f64>::extract(arrays)?),
+    }
+}
+
+fn backward<'py, T: Real + Element>(
+    py: Python<'py>,
+    degree: usize,
+    arrays: &Arrays<'py, T>,
+    v_colors: &Bound<'py, PyAny>,
+    [dirs, coefficients]: [bool; 2],
+) -> PyResult<Bound<'py, PyTuple>> {
+    let harmonics = arrays.harmonics(degree)?;
+    let v_colors = slice::<T>("v_colors", v_colors)?;
+    let v_colors = v_colors.as_slice()?.as_chunks().0;
+    let gradients = run(py, || harmonics.vjp(v_colors, dirs, coefficients))?;
+    (
+        gradient(py, gradients.dirs.into_flattened()),
+        gradient(py, gradients.coefficients),
+    )
+        .into_pyobject(py)
+}
+
+/// Gradients of dirs and coeffs, flat; what is not wanted is an empty array. Takes the arrays of the forward call.
+#[pyfunction]
+pub(crate) fn harmonics_backward<'py>(
+    py: Python<'py>,
+    degree: usize,
+    arrays: &Bound<'py, PyTuple>,
+    v_colors: &Bound<'py, PyAny>,
+    wanted: [bool; 2],
+) -> PyResult<Bound<'py, PyTuple>> {
+    match Arrays::<f32>::extract(arrays) {
+        Ok(single) => backward(py, degree, &single, v_colors, wanted),
+        Err(_) => backward(py, degree, &Arrays::<f64>::extract(arrays)?, v_colors, wanted),
+    }
+}
