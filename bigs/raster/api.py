@@ -63,8 +63,8 @@ def rasterization(
         backgrounds: the colour behind everything; black by default. Depth has none.
         pixel_mask: bool; a pixel where it is False is neither rendered nor differentiated and shows the
             background with alpha 0.
-        sh_degree: 0 to 3: colours depend on the direction from camera to Gaussian, with signs and order of the
-            basis, the added 0.5 and the limit at 0 as in 3D Gaussian splatting. None: they do not.
+        sh_degree: 0 to 3, None for plain colours. The direction is from the camera to the Gaussian; signs and
+            order of the basis, the added 0.5 and the limit at 0 are those of 3D Gaussian splatting.
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
         camera_model: "pinhole", or "ortho": parallel rays, x = fx X + cx with fx in pixels per metre. Depth
             is camera z in both, and so are the near and the far plane.

@@ -27,8 +27,8 @@ def spherical_harmonics(
 ) -> torch.Tensor:
     """Red, green and blue of spherical harmonics seen along directions, differentiable in both.
 
-    Signs and order of the basis are those of 3D Gaussian splatting and gsplat. There the colour of a Gaussian is
-    this plus 0.5, limited to at least 0; `rasterization` with `sh_degree` does that.
+    Signs and order of the basis are those of 3D Gaussian splatting and gsplat. There the colour of a Gaussian
+    is this plus 0.5, limited to at least 0; `rasterization` with `sh_degree` does that.
 
     Args:
         degree: 0 to 3; bases beyond (degree + 1)² are left out.
