@@ -69,7 +69,7 @@ impl<'a, T: Real> Harmonics<'a, T> {
         }
         let n = coefficients.len() / (3 * bases);
         check_length("coefficients", n * 3 * bases, coefficients.len())?;
-        let places = if n == 0 { 0 } else { dirs.len() / n };
+        let places = dirs.len().checked_div(n).unwrap_or(0);
         check_length("dirs", places * n, dirs.len())?;
         if let Some(mask) = mask {
             check_length("mask", dirs.len(), mask.len())?;
@@ -164,7 +164,7 @@ impl<'a, T: Real> Harmonics<'a, T> {
     fn vjp_bands<const B: usize>(&self, v_colors: &[[T; 3]], out: &mut HarmonicsGradients<T>) {
         let n = self.gaussians();
         let chunks = n.div_ceil(CHUNK);
-        let places = if n == 0 { 0 } else { self.dirs.len() / n };
+        let places = self.dirs.len().checked_div(n).unwrap_or(0);
         let mut v_dirs = by_chunk(&mut out.dirs, n);
         v_dirs.resize_with(chunks, Vec::new);
         let mut v_coefficients: Vec<&mut [T]> = out.coefficients.chunks_mut(CHUNK * 3 * self.bases).collect();
