@@ -87,4 +87,4 @@ def simd_level() -> str:
     """The CPU feature level the kernels run at: avx512, avx2, neon or baseline."""
 
 def fma_peak_gflops() -> float:
-    """Measured peak of one thread in 10⁹ float32 operations per second at that level; a multiply-add is two."""
+    """Measured peak of one thread at that level, 10⁹ float32 operations per second; a multiply-add is two."""
