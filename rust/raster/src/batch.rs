@@ -135,7 +135,7 @@ pub struct BatchImages<T> {
 
 /// What the forward pass of a batch keeps for the backward pass.
 #[derive(Debug)]
-pub struct BatchState<T> {
+pub struct BatchState<T: Real> {
     views: Vec<ViewState<T>>,
 }
 
@@ -146,16 +146,19 @@ pub struct Counters {
     pub intersections: usize,
     /// Gaussians that some pixel may see.
     pub visible: usize,
+    /// Gaussians that no pixel can see: behind, off the image, too faint or too small.
+    pub culled: usize,
     /// Tiles that nothing reaches or that `pixel_mask` closes.
     pub empty_tiles: usize,
 }
 
-impl<T> BatchState<T> {
+impl<T: Real> BatchState<T> {
     /// Sums over the views.
     pub fn counters(&self) -> Counters {
         self.views.iter().fold(Counters::default(), |sum, view| Counters {
             intersections: sum.intersections + view.intersections(),
             visible: sum.visible + view.visible(),
+            culled: sum.culled + view.culled(),
             empty_tiles: sum.empty_tiles + view.empty_tiles(),
         })
     }

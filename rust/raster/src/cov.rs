@@ -42,12 +42,12 @@ pub(crate) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T) {
         .abs()
         .greater(q[1].abs())
         .greater(q[2].abs().greater(q[3].abs()));
-    if largest < T::TINY {
-        return ([T::ZERO; 4], T::ZERO);
-    }
-    let r = q.map(|v| v / largest);
-    let inverse = T::ONE / (r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]).sqrt();
-    (r.map(|v| v * inverse), inverse / largest)
+    let directed = largest >= T::TINY;
+    let shrink = T::ONE / largest.greater(T::TINY);
+    let r = q.map(|v| v * shrink);
+    let length = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]).sqrt();
+    let inverse = if directed { T::ONE / length } else { T::ZERO };
+    (r.map(|v| v * inverse), inverse * shrink)
 }
 
 /// Rotation matrix of a unit quaternion (w, x, y, z); the identity for (0, 0, 0, 0).
@@ -104,8 +104,14 @@ pub(crate) struct Whitening<T> {
     pub(crate) w22: T,
     /// Standard deviations of Σ along x and y, in px.
     pub(crate) deviations: [T; 2],
+    /// dx of the middle of a row of pixels through the ellipse, per dy.
+    pub(crate) slope: T,
+    /// dy of the ellipse's rightmost point, per dx.
+    pub(crate) tilt: T,
     /// √(det A Aᵀ / det Σ): what `antialiased` scales opacity by.
     pub(crate) compensation: T,
+    /// Σ is neither singular nor beyond the numbers; if it is, nothing else here means anything.
+    pub(crate) sound: bool,
 }
 
 /// A and Σ in units that keep a determinant, a fourth power, within range.
@@ -153,22 +159,23 @@ fn scaled<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Scaled<T> {
     }
 }
 
-/// The whitening of A with rows `r0`, `r1`; `None` if Σ is singular or overflows.
+/// The whitening of A with rows `r0`, `r1`.
 #[inline(always)]
-pub(crate) fn whiten<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Option<Whitening<T>> {
+pub(crate) fn whiten<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Whitening<T> {
     let s = scaled(r0, r1, eps);
-    if !(s.det >= T::TINY && s.det.is_finite()) {
-        return None;
-    }
     let scale = T::of(EXP2_SCALE) * s.unit;
     let w11 = scale * (s.c / s.det).sqrt();
-    Some(Whitening {
+    let slope = s.b / s.c;
+    Whitening {
         w11,
-        w12: -w11 * (s.b / s.c),
+        w12: -w11 * slope,
         w22: scale / s.c.sqrt(),
         deviations: [s.a.sqrt() / s.unit, s.c.sqrt() / s.unit],
+        slope,
+        tilt: s.b / s.a,
         compensation: (s.area / s.det).sqrt(),
-    })
+        sound: (s.det >= T::TINY) & s.det.is_finite(),
+    }
 }
 
 /// Gradients of the rows of A.
@@ -183,7 +190,7 @@ pub(crate) fn whiten_vjp<T: Real>(
     eps: T,
     w: &Whitening<T>,
     moments: [T; 3],
-    v_compensation: T,
+    v_compensation: Option<T>,
 ) -> (Vec3<T>, Vec3<T>) {
     let s = scaled(r0, r1, eps);
     let two = T::ONE + T::ONE;
@@ -197,7 +204,7 @@ pub(crate) fn whiten_vjp<T: Real>(
     let g1 = [0, 1, 2].map(|i| gain * (uv * p0[i] + vv * p1[i]));
     let mut v_r0 = g0.map(|g| w.w11 * g);
     let mut v_r1 = [0, 1, 2].map(|i| w.w12 * g0[i] + w.w22 * g1[i]);
-    if v_compensation != T::ZERO {
+    if let Some(v_compensation) = v_compensation {
         // compensation = |n| / √det with n = r₀ × r₁
         let v_det = -v_compensation * w.compensation / (two * s.det);
         let outward = if s.area >= T::TINY {
@@ -253,13 +260,13 @@ mod tests {
         let rows = [[1.5, 0.2, -0.4], [0.3, 0.9, 0.1]];
         let (d, weight, eps) = ([0.7, -1.2], 0.8, 0.3);
         let value = |rows: [[f64; 3]; 2]| {
-            let w = whiten(rows[0], rows[1], eps).unwrap();
+            let w = whiten(rows[0], rows[1], eps);
             let (u, v) = (w.w11 * d[0] + w.w12 * d[1], w.w22 * d[1]);
             -(u * u + v * v) + weight * w.compensation
         };
-        let w = whiten(rows[0], rows[1], eps).unwrap();
+        let w = whiten(rows[0], rows[1], eps);
         let (u, v) = (w.w11 * d[0] + w.w12 * d[1], w.w22 * d[1]);
-        let (g0, g1) = whiten_vjp(rows[0], rows[1], eps, &w, [u * u, u * v, v * v], weight);
+        let (g0, g1) = whiten_vjp(rows[0], rows[1], eps, &w, [u * u, u * v, v * v], Some(weight));
         for (row, gradient) in [(0, g0), (1, g1)] {
             for i in 0..3 {
                 let expected = difference(|h| {
@@ -278,19 +285,18 @@ mod tests {
         let (cos, sin) = (0.6f64, 0.8f64);
         let long = [300.0 * cos, 300.0 * sin];
         let short = [-0.03 * sin, 0.03 * cos];
-        let exact = whiten([long[0], short[0], 0.0], [long[1], short[1], 0.0], 0.3).unwrap();
+        let exact = whiten([long[0], short[0], 0.0], [long[1], short[1], 0.0], 0.3);
         let single = whiten(
             [long[0] as f32, short[0] as f32, 0.0],
             [long[1] as f32, short[1] as f32, 0.0],
             0.3,
-        )
-        .unwrap();
+        );
         assert!((f64::from(single.w11) / exact.w11 - 1.0).abs() < 1e-6);
     }
 
     #[test]
     fn determinants_beyond_the_range_of_numbers_are_no_obstacle() {
-        let w = whiten([3e15f32, 0.0, 0.0], [0.0, 1e15, 0.0], 0.3).unwrap();
+        let w = whiten([3e15f32, 0.0, 0.0], [0.0, 1e15, 0.0], 0.3);
         assert!((f64::from(w.w11) * 3e15 / EXP2_SCALE - 1.0).abs() < 1e-6);
         assert!((f64::from(w.w22) * 1e15 / EXP2_SCALE - 1.0).abs() < 1e-6);
         assert!((w.deviations[0] / 3e15 - 1.0).abs() < 1e-6);
@@ -298,8 +304,8 @@ mod tests {
 
     #[test]
     fn hopeless_covariances_are_refused() {
-        assert!(whiten([0.0f32; 3], [0.0; 3], 0.0).is_none());
-        assert!(whiten([1e-20f32, 0.0, 0.0], [0.0, 1e-20, 0.0], 0.0).is_none());
+        assert!(!whiten([0.0f32; 3], [0.0; 3], 0.0).sound);
+        assert!(!whiten([1e-20f32, 0.0, 0.0], [0.0, 1e-20, 0.0], 0.0).sound);
         assert_eq!(normalize_quat([0.0f32; 4]), ([0.0; 4], 0.0));
         assert_eq!(normalize_quat([1e-30f32, 0.0, 0.0, 0.0]).0, [1.0, 0.0, 0.0, 0.0]);
     }

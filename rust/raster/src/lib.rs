@@ -82,13 +82,16 @@
 
 mod batch;
 mod camera;
+mod chunk;
 mod composite;
 mod cov;
 mod dispatch;
 mod error;
 mod gaussians;
 mod kernel;
+mod levels;
 pub mod peak;
+mod pool;
 mod project;
 mod real;
 mod render;
@@ -104,6 +107,7 @@ pub use batch::{
 pub use camera::{Camera, CameraModel, Intrinsics};
 pub use error::RasterError;
 pub use gaussians::Gaussians;
+pub use pool::release_memory;
 pub use real::{Arithmetic, Real};
 pub use render::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};

@@ -1,13 +1,11 @@
-//! World-space Gaussians to screen-space splats (EWA), and back for gradients.
-
-use rayon::prelude::*;
+//! One Gaussian to one splat on the screen (EWA), and back for gradients.
+//!
+//! Everything here is free of branches that depend on the Gaussian, so that `chunk` can run it on many at once.
 
 use crate::camera::{Camera, CameraModel};
 use crate::cov::{
-    Mat3, Vec3, Whitening, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, whiten,
-    whiten_vjp,
+    Mat3, Vec3, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, whiten, whiten_vjp,
 };
-use crate::gaussians::Gaussians;
 use crate::real::Real;
 use crate::settings::Limits;
 
@@ -15,11 +13,8 @@ use crate::settings::Limits;
 /// far outside the view the linearisation would blow a Gaussian up across the whole image.
 const FRUSTUM_MARGIN: f64 = 0.3 * 0.5;
 
-/// Gaussians handled by one task. Fixed, so that sums over chunks do not depend on the number of threads.
-const CHUNK: usize = 512;
-
 /// A Gaussian on the screen.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Splat<T> {
     pub(crate) x: T,
     pub(crate) y: T,
@@ -34,18 +29,46 @@ pub(crate) struct Splat<T> {
     pub(crate) depth: T,
 }
 
-/// The splats a camera sees, in the order of the Gaussians.
-#[derive(Debug)]
-pub(crate) struct Projected<T> {
-    pub(crate) ids: Vec<u32>,
-    pub(crate) splats: Vec<Splat<T>>,
-}
-
 /// What is told about every Gaussian, visible or not (zeros).
+#[derive(Debug)]
 pub(crate) struct ScreenInfo<'a, T> {
     pub(crate) means2d: &'a mut [[T; 2]],
     pub(crate) depths: &'a mut [T],
     pub(crate) radii: &'a mut [[i32; 2]],
+}
+
+/// A camera, a view's rules and what follows from both alone.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Lens<T> {
+    camera: Camera<T>,
+    limits: Limits<T>,
+    perspective: bool,
+    /// Least and greatest slope for the Jacobian, along x and y.
+    slopes: [(T, T); 2],
+    size: [T; 2],
+    /// log₂ of the alpha threshold.
+    log_threshold: T,
+}
+
+impl<T: Real> Lens<T> {
+    pub(crate) fn new(camera: &Camera<T>, limits: &Limits<T>) -> Self {
+        let k = &camera.k;
+        let size = [T::of(camera.width as f64), T::of(camera.height as f64)];
+        let margin = T::of(FRUSTUM_MARGIN);
+        let slopes = |f: T, c: T, size: T| (-(c + margin * size) / f, (size - c + margin * size) / f);
+        Self {
+            camera: *camera,
+            limits: *limits,
+            perspective: camera.model == CameraModel::Pinhole,
+            slopes: [slopes(k.fx, k.cx, size[0]), slopes(k.fy, k.cy, size[1])],
+            size,
+            log_threshold: limits.alpha_threshold.greater(T::TINY).log2(),
+        }
+    }
+
+    pub(crate) fn antialiased(&self) -> bool {
+        self.limits.antialiased
+    }
 }
 
 /// A Gaussian in front of a camera, halfway to the screen: everything both passes need.
@@ -57,6 +80,9 @@ struct Footprint<T> {
     axes: Mat3<T>,
     /// Camera rotation · axes · diag(scales).
     shape: Mat3<T>,
+    /// What perspective divides by: camera z, or 1 without it. And its reciprocal.
+    z: T,
+    inverse_z: T,
     /// Pixels per unit of length at the centre.
     gains: [T; 2],
     /// x/z and y/z after the limit, and whether each is free (within it). Without perspective zero, and held.
@@ -67,26 +93,10 @@ struct Footprint<T> {
 }
 
 #[inline(always)]
-fn to_camera<T: Real>(camera: &Camera<T>, mean: Vec3<T>) -> Vec3<T> {
+fn footprint<T: Real>(lens: &Lens<T>, mean: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
+    let camera = &lens.camera;
     let rotated = apply(&camera.rotation, mean);
-    [0, 1, 2].map(|i| rotated[i] + camera.translation[i])
-}
-
-/// Where the camera shows the centre, in pixels.
-#[inline(always)]
-fn centre<T: Real>(camera: &Camera<T>, point: Vec3<T>) -> [T; 2] {
-    let k = &camera.k;
-    match camera.model {
-        CameraModel::Pinhole => [
-            k.fx * (point[0] / point[2]) + k.cx,
-            k.fy * (point[1] / point[2]) + k.cy,
-        ],
-        CameraModel::Orthographic => [k.fx * point[0] + k.cx, k.fy * point[1] + k.cy],
-    }
-}
-
-#[inline(always)]
-fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
+    let point = [0, 1, 2].map(|i| rotated[i] + camera.translation[i]);
     let (unit_quat, inverse_quat_length) = normalize_quat(quat);
     let axes = rotation_of(unit_quat);
     let scaled = axes.map(|row| [row[0] * scale[0], row[1] * scale[1], row[2] * scale[2]]);
@@ -95,150 +105,108 @@ fn footprint<T: Real>(camera: &Camera<T>, point: Vec3<T>, quat: [T; 4], scale: V
         .map(|row| [0, 1, 2].map(|j| row[0] * scaled[0][j] + row[1] * scaled[1][j] + row[2] * scaled[2][j]));
 
     let k = &camera.k;
-    let ([gx, gy], [(sx, free_x), (sy, free_y)]) = match camera.model {
-        CameraModel::Pinhole => {
-            let inverse_z = T::ONE / point[2];
-            let margin = T::of(FRUSTUM_MARGIN);
-            let limit_slope = |p: T, f: T, c: T, size: usize| {
-                let size = T::of(size as f64);
-                let slope = p * inverse_z;
-                let limited = slope.limit(-(c + margin * size) / f, (size - c + margin * size) / f);
-                (limited, limited == slope)
-            };
-            (
-                [k.fx * inverse_z, k.fy * inverse_z],
-                [
-                    limit_slope(point[0], k.fx, k.cx, camera.width),
-                    limit_slope(point[1], k.fy, k.cy, camera.height),
-                ],
-            )
-        }
-        CameraModel::Orthographic => ([k.fx, k.fy], [(T::ZERO, false); 2]),
+    let z = if lens.perspective { point[2] } else { T::ONE };
+    let inverse_z = T::ONE / z;
+    let limit_slope = |p: T, (least, greatest): (T, T)| {
+        let slope = p * inverse_z;
+        let limited = slope.limit(least, greatest);
+        (
+            if lens.perspective { limited } else { T::ZERO },
+            lens.perspective & (limited == slope),
+        )
     };
-    let rows = [
-        [0, 1, 2].map(|j| gx * (shape[0][j] - sx * shape[2][j])),
-        [0, 1, 2].map(|j| gy * (shape[1][j] - sy * shape[2][j])),
-    ];
+    let (sx, free_x) = limit_slope(point[0], lens.slopes[0]);
+    let (sy, free_y) = limit_slope(point[1], lens.slopes[1]);
+    let (gx, gy) = (k.fx * inverse_z, k.fy * inverse_z);
     Footprint {
         point,
         unit_quat,
         inverse_quat_length,
         axes,
         shape,
+        z,
+        inverse_z,
         gains: [gx, gy],
         slopes: [sx, sy],
         free: [free_x, free_y],
-        rows,
+        rows: [
+            [0, 1, 2].map(|j| gx * (shape[0][j] - sx * shape[2][j])),
+            [0, 1, 2].map(|j| gy * (shape[1][j] - sy * shape[2][j])),
+        ],
     }
 }
 
-/// The splat of one Gaussian and its radii on screen; `None` if no pixel can see it.
+/// A splat and its outline: the ellipse {u² + v² ≤ reach}.
+pub(crate) struct Outlined<T> {
+    pub(crate) splat: Splat<T>,
+    /// Half the extent along x and y, in px.
+    pub(crate) radii: [T; 2],
+    /// Standard deviations along x and y, in px.
+    pub(crate) deviations: [T; 2],
+    /// As in [`crate::cov::Whitening`].
+    pub(crate) slope: T,
+    pub(crate) tilt: T,
+    /// Whether some pixel may see it; if not, nothing else here means anything.
+    pub(crate) visible: bool,
+}
+
+/// How far an ellipse of this reach extends, per standard deviation.
 #[inline(always)]
-fn splat<T: Real>(
-    camera: &Camera<T>,
-    limits: &Limits<T>,
+pub(crate) fn extent<T: Real>(reach: T) -> T {
+    (T::of(2.0 * std::f64::consts::LN_2) * reach).sqrt()
+}
+
+/// The splat of one Gaussian.
+#[inline(always)]
+pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
+    lens: &Lens<T>,
     mean: Vec3<T>,
     quat: [T; 4],
     scale: Vec3<T>,
     opacity: T,
-) -> Option<(Splat<T>, [T; 2])> {
-    let point = to_camera(camera, mean);
-    let depth = point[2];
-    // Written so that NaN, which finite inputs can still overflow to, is culled too.
-    if !(depth > limits.near && depth < limits.far) {
-        return None;
-    }
-    let [x, y] = centre(camera, point);
-    let shape = footprint(camera, point, quat, scale);
-    let w = whiten(shape.rows[0], shape.rows[1], limits.eps2d)?;
-    let opacity = if limits.antialiased {
+) -> Outlined<T> {
+    let (k, limits) = (&lens.camera.k, &lens.limits);
+    let shape = footprint(lens, mean, quat, scale);
+    let depth = shape.point[2];
+    // Divided, not multiplied by a rounded reciprocal: a pixel position has few bits to spare.
+    let x = k.fx * (shape.point[0] / shape.z) + k.cx;
+    let y = k.fy * (shape.point[1] / shape.z) + k.cy;
+    let w = whiten(shape.rows[0], shape.rows[1], limits.eps2d);
+    let opacity = if ANTIALIASED {
         opacity * w.compensation
     } else {
         opacity
     };
-    if !(opacity >= limits.alpha_threshold) {
-        return None;
-    }
     let reach = if limits.alpha_threshold > T::ZERO {
-        (opacity / limits.alpha_threshold).log2()
+        opacity.greater(T::TINY).log2() - lens.log_threshold
     } else {
         T::of(f64::INFINITY)
     };
-    let two_ln_2 = T::of(2.0 * std::f64::consts::LN_2);
-    let radius = w
-        .deviations
-        .map(|deviation| (two_ln_2 * reach).sqrt() * deviation);
-    let (width, height) = (T::of(camera.width as f64), T::of(camera.height as f64));
-    let on_screen =
-        x + radius[0] > T::ZERO && x - radius[0] < width && y + radius[1] > T::ZERO && y - radius[1] < height;
-    let clipped = radius[0] <= limits.radius_clip && radius[1] <= limits.radius_clip;
+    let extent = extent(reach);
+    let [rx, ry] = w.deviations.map(|deviation| extent * deviation);
+    // Comparisons are written so that NaN, which finite inputs can still overflow to, is culled too.
+    let in_range = (depth > limits.near) & (depth < limits.far) & w.sound & x.is_finite() & y.is_finite();
+    let [width, height] = lens.size;
+    let on_screen = (x + rx > T::ZERO) & (x - rx < width) & (y + ry > T::ZERO) & (y - ry < height);
     // Radius 0 is a Gaussian that reaches the threshold only at its very centre.
-    if !on_screen || (clipped && limits.radius_clip > T::ZERO) || !(x.is_finite() && y.is_finite()) {
-        return None;
+    let clipped = (rx <= limits.radius_clip) & (ry <= limits.radius_clip) & (limits.radius_clip > T::ZERO);
+    Outlined {
+        splat: Splat {
+            x,
+            y,
+            w11: w.w11,
+            w12: w.w12,
+            w22: w.w22,
+            opacity,
+            reach,
+            depth,
+        },
+        radii: [rx, ry],
+        deviations: w.deviations,
+        slope: w.slope,
+        tilt: w.tilt,
+        visible: in_range & on_screen & !clipped & (opacity >= limits.alpha_threshold),
     }
-    let splat = Splat {
-        x,
-        y,
-        w11: w.w11,
-        w12: w.w12,
-        w22: w.w22,
-        opacity,
-        reach,
-        depth,
-    };
-    Some((splat, radius))
-}
-
-/// Projects every Gaussian of a view.
-pub(crate) fn project<T: Real>(
-    gaussians: &Gaussians<'_, T>,
-    camera: &Camera<T>,
-    limits: &Limits<T>,
-    info: ScreenInfo<'_, T>,
-) -> Projected<T> {
-    let chunks: Vec<(Vec<u32>, Vec<Splat<T>>)> = (
-        info.means2d.par_chunks_mut(CHUNK),
-        info.depths.par_chunks_mut(CHUNK),
-        info.radii.par_chunks_mut(CHUNK),
-    )
-        .into_par_iter()
-        .enumerate()
-        .map(|(chunk, (means2d, depths, radii))| {
-            let first = chunk * CHUNK;
-            let mut ids = Vec::with_capacity(depths.len());
-            let mut splats = Vec::with_capacity(depths.len());
-            for local in 0..depths.len() {
-                let i = first + local;
-                let Some((splat, radius)) = splat(
-                    camera,
-                    limits,
-                    gaussians.means[i],
-                    gaussians.quats[i],
-                    gaussians.scales[i],
-                    gaussians.opacities[i],
-                ) else {
-                    continue;
-                };
-                means2d[local] = [splat.x, splat.y];
-                depths[local] = splat.depth;
-                // The cast saturates, so an unbounded Gaussian gets the largest integer.
-                radii[local] = radius.map(|r| r.as_f64().ceil() as i32);
-                ids.push(i as u32);
-                splats.push(splat);
-            }
-            (ids, splats)
-        })
-        .collect();
-    let visible = chunks.iter().map(|(ids, _)| ids.len()).sum();
-    let mut projected = Projected {
-        ids: Vec::with_capacity(visible),
-        splats: Vec::with_capacity(visible),
-    };
-    for (ids, splats) in chunks {
-        projected.ids.extend(ids);
-        projected.splats.extend(splats);
-    }
-    projected
 }
 
 /// Gradients of a splat as the compositor sums them: over pixels, h = ∂loss/∂alpha · 2^−(u² + v²).
@@ -263,39 +231,29 @@ pub(crate) struct GaussianGradient<T> {
     pub(crate) viewmat: [[T; 4]; 3],
 }
 
-/// The vjp of [`splat`]; zero for a Gaussian that has none.
+/// The vjp of [`splat`] for a visible Gaussian.
 #[inline(always)]
-pub(crate) fn project_vjp<T: Real>(
-    gaussians: &Gaussians<'_, T>,
-    camera: &Camera<T>,
-    limits: &Limits<T>,
-    i: usize,
+pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
+    lens: &Lens<T>,
+    mean: Vec3<T>,
+    quat: [T; 4],
+    scale: Vec3<T>,
+    opacity: T,
     v: &SplatGradient<T>,
-) -> Option<GaussianGradient<T>> {
-    let (mean, scale, opacity) = (gaussians.means[i], gaussians.scales[i], gaussians.opacities[i]);
-    let shape = footprint(camera, to_camera(camera, mean), gaussians.quats[i], scale);
-    let w: Whitening<T> = whiten(shape.rows[0], shape.rows[1], limits.eps2d)?;
-    let (compensation, v_compensation) = if limits.antialiased {
-        (w.compensation, v.h * opacity)
-    } else {
-        (T::ONE, T::ZERO)
-    };
+) -> GaussianGradient<T> {
+    let (camera, eps) = (&lens.camera, lens.limits.eps2d);
+    let shape = footprint(lens, mean, quat, scale);
+    let w = whiten(shape.rows[0], shape.rows[1], eps);
+    let compensation = if ANTIALIASED { w.compensation } else { T::ONE };
 
     // alpha = opacity · 2^e, so the gradient of e is ln 2 · opacity · h; e = −(u² + v²).
-    let ln_2 = T::of(std::f64::consts::LN_2);
-    let gain = ln_2 * opacity * compensation;
+    let gain = T::of(std::f64::consts::LN_2) * opacity * compensation;
     let two = T::ONE + T::ONE;
     let v_x = two * gain * w.w11 * v.first[0];
     let v_y = two * gain * (w.w12 * v.first[0] + w.w22 * v.first[1]);
+    let v_compensation = if ANTIALIASED { Some(v.h * opacity) } else { None };
     let moments = v.second.map(|m| gain * m);
-    let (v_r0, v_r1) = whiten_vjp(
-        shape.rows[0],
-        shape.rows[1],
-        limits.eps2d,
-        &w,
-        moments,
-        v_compensation,
-    );
+    let (v_r0, v_r1) = whiten_vjp(shape.rows[0], shape.rows[1], eps, &w, moments, v_compensation);
 
     let [gx, gy] = shape.gains;
     let [sx, sy] = shape.slopes;
@@ -305,26 +263,17 @@ pub(crate) fn project_vjp<T: Real>(
         v_r1.map(|g| gy * g),
         [0, 1, 2].map(|j| -(gx * sx * v_r0[j] + gy * sy * v_r1[j])),
     ];
-    let k = &camera.k;
-    let v_point = match camera.model {
-        CameraModel::Pinhole => {
-            let inverse_z = T::ONE / shape.point[2];
-            let mut v_z = v.depth - inverse_z * (dot(shape.rows[0], v_r0) + dot(shape.rows[1], v_r1));
-            // Slopes: of the centre on screen always, of the Jacobian where the limit does not hold.
-            let mut v_sx = k.fx * v_x;
-            let mut v_sy = k.fy * v_y;
-            let (slope_x, slope_y) = (shape.point[0] * inverse_z, shape.point[1] * inverse_z);
-            if shape.free[0] {
-                v_sx += -gx * dot(shape.shape[2], v_r0);
-            }
-            if shape.free[1] {
-                v_sy += -gy * dot(shape.shape[2], v_r1);
-            }
-            v_z += -(v_sx * slope_x + v_sy * slope_y) * inverse_z;
-            [v_sx * inverse_z, v_sy * inverse_z, v_z]
-        }
-        CameraModel::Orthographic => [k.fx * v_x, k.fy * v_y, v.depth],
-    };
+    // Slopes: of the centre on screen always, of the Jacobian where the limit does not hold.
+    let held = |free: bool, v: T| if free { v } else { T::ZERO };
+    let v_sx = camera.k.fx * v_x - held(shape.free[0], gx * dot(shape.shape[2], v_r0));
+    let v_sy = camera.k.fy * v_y - held(shape.free[1], gy * dot(shape.shape[2], v_r1));
+    let (slope_x, slope_y) = (shape.point[0] * shape.inverse_z, shape.point[1] * shape.inverse_z);
+    let nearer = dot(shape.rows[0], v_r0) + dot(shape.rows[1], v_r1) + v_sx * slope_x + v_sy * slope_y;
+    let v_point = [
+        v_sx * shape.inverse_z,
+        v_sy * shape.inverse_z,
+        v.depth - held(lens.perspective, shape.inverse_z * nearer),
+    ];
 
     // shape = R · axes · diag(scale)
     let columns =
@@ -339,11 +288,11 @@ pub(crate) fn project_vjp<T: Real>(
                     + v_shape[r][2] * shape.axes[c][2] * scale[2])
         })
     });
-    Some(GaussianGradient {
+    GaussianGradient {
         mean: apply_transposed(&camera.rotation, v_point),
         quat: rotation_vjp(shape.unit_quat, shape.inverse_quat_length, &v_axes),
         scale: v_scale,
         opacity: v.h * compensation,
         viewmat: [0, 1, 2].map(|r| [v_rotation[r][0], v_rotation[r][1], v_rotation[r][2], v_point[r]]),
-    })
+    }
 }

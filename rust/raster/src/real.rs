@@ -45,7 +45,7 @@ pub trait Real:
     fn sqrt(self) -> Self;
     /// |x|
     fn abs(self) -> Self;
-    /// log₂ x
+    /// log₂ x for a positive normal x, without branches.
     fn log2(self) -> Self;
     /// ⌊x⌋ for 0 ≤ x < 2³¹.
     fn truncate(self) -> usize;
@@ -161,7 +161,19 @@ macro_rules! real {
             }
             #[inline(always)]
             fn log2(self) -> Self {
-                <$T>::log2(self)
+                // x = m 2ᵉ with m in [√½, √2); log₂ m is 2/ln 2 · artanh((m − 1)/(m + 1)), a series in odd powers.
+                let least = (std::f64::consts::FRAC_1_SQRT_2 as $T).to_bits();
+                let bits = self.to_bits();
+                let exponent = bits.wrapping_sub(least).cast_signed() >> $mantissa;
+                let m = <$T>::from_bits(bits.wrapping_sub((exponent << $mantissa).cast_unsigned()));
+                let s = (m - 1.0) / (m + 1.0);
+                let mut sum = 0.0;
+                let mut k = $coefficients.len();
+                while k > 0 {
+                    k -= 1;
+                    sum = sum * (s * s) + (2.0 * std::f64::consts::LOG2_E / (2 * k + 1) as f64) as $T;
+                }
+                exponent as $T + s * sum
             }
             #[inline(always)]
             fn truncate(self) -> usize {
@@ -252,6 +264,26 @@ mod tests {
             assert!(error.abs() < 2.5e-7, "{x}: {error}");
             assert_eq!(x.reciprocal::<Separate>(), 1.0 / x);
         }
+    }
+
+    #[test]
+    fn log2_matches_the_library() {
+        let mut x = f64::from(f32::MIN_POSITIVE);
+        while x < f64::from(f32::MAX) {
+            let exact = x.log2();
+            assert!(
+                (Real::log2(x) - exact).abs() <= 1e-15 * (1.0 + exact.abs()),
+                "{x}"
+            );
+            let single = Real::log2(x as f32);
+            let exact = f64::from(x as f32).log2();
+            assert!(
+                (f64::from(single) - exact).abs() <= 2e-7 * (1.0 + exact.abs()),
+                "{x}"
+            );
+            x *= 1.003;
+        }
+        assert_eq!((Real::log2(1f32), Real::log2(8f64)), (0.0, 3.0));
     }
 
     #[test]

@@ -3,17 +3,18 @@
 use rayon::prelude::*;
 
 use crate::camera::Camera;
+use crate::chunk::{CHUNK, ChunkGradients, ChunkSplats};
 use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp};
+use crate::dispatch::SimdLevel;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
 use crate::kernel::{Channels, MOMENTS};
-use crate::project::{Projected, ScreenInfo, Splat, SplatGradient, project, project_vjp};
+use crate::levels;
+use crate::pool::{Buffers, Pooled, bytes_of, stale};
+use crate::project::{Lens, ScreenInfo, Splat};
 use crate::real::Real;
 use crate::settings::{Limits, RasterSettings, RenderMode};
-use crate::tiles::{TileBins, TileGrid, bin_tiles, sort_by_depth};
-
-/// Gaussians whose gradients one task gathers. Fixed, so that sums do not depend on the number of threads.
-const CHUNK: usize = 512;
+use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, count_pairs, fill_bins, sort_by_depth};
 
 /// Everything one image is made of.
 #[derive(Clone, Copy, Debug)]
@@ -31,26 +32,128 @@ pub(crate) struct Image<'a, T> {
     pub(crate) screen: ScreenInfo<'a, T>,
 }
 
+/// A view's splats and which tiles they reach.
+#[derive(Debug)]
+pub(crate) struct Binned<T> {
+    /// By Gaussian; zeros for one that no pixel sees.
+    pub(crate) splats: Vec<Splat<T>>,
+    /// 0, 1, 2, … as far as any view needed: the Gaussian of each splat.
+    ids: Vec<u32>,
+    /// By chunk of Gaussians.
+    covers: Vec<Cover>,
+    pub(crate) bins: TileBins,
+}
+
+impl<T> Default for Binned<T> {
+    fn default() -> Self {
+        Self {
+            splats: Vec::new(),
+            ids: Vec::new(),
+            covers: Vec::new(),
+            bins: TileBins::default(),
+        }
+    }
+}
+
+impl<T: Real> Buffers for Binned<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.splats)
+            + bytes_of(&self.ids)
+            + self.covers.iter().map(Cover::bytes).sum::<usize>()
+            + self.bins.bytes()
+    }
+}
+
+impl<T: Real> Buffers for BinScratch<T> {
+    fn bytes(&self) -> usize {
+        self.bytes()
+    }
+}
+
+impl<T: Real> Binned<T> {
+    fn chunks(&self) -> &[Cover] {
+        &self.covers[..self.splats.len().div_ceil(CHUNK)]
+    }
+
+    /// The Gaussian of each splat.
+    pub(crate) fn ids(&self) -> &[u32] {
+        &self.ids[..self.splats.len()]
+    }
+
+    /// Projects the Gaussians of a view and finds the tiles that each reaches.
+    pub(crate) fn project(
+        &mut self,
+        view: &View<'_, T>,
+        limits: &Limits<T>,
+        grid: &TileGrid,
+        wanted: Option<&[bool]>,
+        screen: ScreenInfo<'_, T>,
+    ) {
+        let n = view.gaussians.len();
+        let chunks = n.div_ceil(CHUNK);
+        self.ids.extend(self.ids.len() as u32..n as u32);
+        if self.covers.len() < chunks {
+            self.covers.resize_with(chunks, Cover::default);
+        }
+        let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
+        (
+            stale(&mut self.splats, n).par_chunks_mut(CHUNK),
+            self.covers[..chunks].par_iter_mut(),
+            screen.means2d.par_chunks_mut(CHUNK),
+            screen.depths.par_chunks_mut(CHUNK),
+            screen.radii.par_chunks_mut(CHUNK),
+        )
+            .into_par_iter()
+            .enumerate()
+            .for_each(|(chunk, (splats, cover, means2d, depths, radii))| {
+                let screen = ScreenInfo {
+                    means2d,
+                    depths,
+                    radii,
+                };
+                let out = ChunkSplats {
+                    splats,
+                    screen,
+                    cover,
+                };
+                levels::project(level, &view.gaussians, chunk * CHUNK, &lens, grid, wanted, out);
+            });
+    }
+
+    /// Sorts the projected splats by depth and lists those of every tile.
+    pub(crate) fn bin(&mut self, grid: &TileGrid, scratch: &mut BinScratch<T>) -> Result<(), RasterError> {
+        let chunks = self.splats.len().div_ceil(CHUNK);
+        count_pairs(&mut self.covers[..chunks], grid.len(), &mut self.bins)?;
+        let covers = &self.covers[..chunks];
+        sort_by_depth(&self.splats, covers, scratch);
+        fill_bins(covers, scratch, &mut self.bins);
+        Ok(())
+    }
+}
+
 /// What the forward pass of a view keeps for the backward pass.
 #[derive(Debug)]
-pub(crate) struct ViewState<T> {
-    ids: Vec<u32>,
-    splats: Vec<Splat<T>>,
-    bins: TileBins,
+pub(crate) struct ViewState<T: Real> {
+    binned: Pooled<Binned<T>>,
     canvas: Canvas<T>,
 }
 
-impl<T> ViewState<T> {
+impl<T: Real> ViewState<T> {
     pub(crate) fn visible(&self) -> usize {
-        self.ids.len()
+        self.binned.chunks().iter().map(|cover| cover.visible).sum()
+    }
+
+    pub(crate) fn culled(&self) -> usize {
+        self.binned.splats.len() - self.visible()
     }
 
     pub(crate) fn intersections(&self) -> usize {
-        self.bins.ranks.len()
+        self.binned.bins.ranks.len()
     }
 
     pub(crate) fn empty_tiles(&self) -> usize {
-        self.bins
+        self.binned
+            .bins
             .offsets
             .windows(2)
             .filter(|pair| pair[0] == pair[1])
@@ -83,15 +186,13 @@ pub(crate) fn scene<'a, T: Real>(
     view: &View<'a, T>,
     mode: RenderMode,
     limits: &'a Limits<T>,
-    splats: &'a [Splat<T>],
-    ids: &'a [u32],
-    bins: &'a TileBins,
+    binned: &'a Binned<T>,
 ) -> Scene<'a, T> {
     Scene {
         grid: TileGrid::new(view.camera.width, view.camera.height, limits.tile_size),
-        bins,
-        splats,
-        ids,
+        bins: &binned.bins,
+        splats: &binned.splats,
+        ids: binned.ids(),
         channels: channels_of(&view.gaussians, mode),
         expected_depth: mode.expects_depth(),
         background: view.background,
@@ -120,19 +221,12 @@ pub(crate) fn render_view<T: Real>(
     image: Image<'_, T>,
 ) -> Result<ViewState<T>, RasterError> {
     let grid = TileGrid::new(view.camera.width, view.camera.height, limits.tile_size);
-    let mut projected = project(&view.gaussians, &view.camera, limits, image.screen);
-    sort_by_depth(&mut projected);
-    let Projected { ids, splats } = projected;
     let wanted = view.pixel_mask.map(|mask| wanted_tiles(mask, &grid));
-    let bins = bin_tiles(&splats, &grid, wanted.as_deref())?;
-    let scene = scene(view, mode, limits, &splats, &ids, &bins);
-    let canvas = composite(&scene, image.colors, image.alphas);
-    Ok(ViewState {
-        ids,
-        splats,
-        bins,
-        canvas,
-    })
+    let mut binned = Pooled::<Binned<T>>::take();
+    binned.project(view, limits, &grid, wanted.as_deref(), image.screen);
+    binned.bin(&grid, &mut Pooled::take())?;
+    let canvas = composite(&scene(view, mode, limits, &binned), image.colors, image.alphas);
+    Ok(ViewState { binned, canvas })
 }
 
 /// Consecutive pieces of `values`, or `count` empty ones if there are no values.
@@ -141,6 +235,54 @@ fn pieces<U>(values: &mut [U], size: usize, count: usize) -> Vec<&mut [U]> {
         (0..count).map(|_| [].as_mut_slice()).collect()
     } else {
         values.chunks_mut(size).collect()
+    }
+}
+
+/// The slots of a view's vjp: `MOMENTS` + channels values per entry of [`TileBins::ranks`].
+#[derive(Clone, Copy)]
+struct Slots<'a, T> {
+    values: &'a [T],
+    channels: Channels<'a, T>,
+}
+
+impl<T: Real> Slots<'_, T> {
+    /// Sums the slots of one Gaussian, tile by tile. Adds the gradients of its colours to `colors` (none if empty);
+    /// returns the moments and the gradient of depth as a channel.
+    #[inline(always)]
+    fn sum(&self, positions: &[u32], colors: &mut [T]) -> [T; MOMENTS + 1] {
+        const RGB: usize = MOMENTS + 3;
+        let Channels { total, colored, .. } = self.channels;
+        let size = MOMENTS + total;
+        let mut sums = [T::ZERO; MOMENTS + 1];
+        if total == 3 && colored == 3 {
+            // The usual case in registers.
+            let mut all = [T::ZERO; RGB];
+            let slots = self.values.as_chunks::<RGB>().0;
+            for &position in positions {
+                let slot = &slots[position as usize];
+                for k in 0..RGB {
+                    all[k] += slot[k];
+                }
+            }
+            sums[..MOMENTS].copy_from_slice(&all[..MOMENTS]);
+            for (sum, &v) in colors.iter_mut().zip(&all[MOMENTS..]) {
+                *sum += v;
+            }
+            return sums;
+        }
+        for &position in positions {
+            let slot = &self.values[position as usize * size..][..size];
+            for k in 0..MOMENTS {
+                sums[k] += slot[k];
+            }
+            for (sum, &v) in colors.iter_mut().zip(&slot[MOMENTS..MOMENTS + colored]) {
+                *sum += v;
+            }
+            if total > colored {
+                sums[MOMENTS] += slot[MOMENTS + colored];
+            }
+        }
+        sums
     }
 }
 
@@ -153,112 +295,74 @@ pub(crate) fn render_view_vjp<T: Real>(
     v: Cotangents<'_, T>,
     out: ViewGradients<'_, T>,
 ) -> usize {
-    let scene = scene(view, mode, limits, &state.splats, &state.ids, &state.bins);
+    let scene = scene(view, mode, limits, &state.binned);
     let gradients = composite_vjp(&scene, &state.canvas, v);
     for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
         *sum += v;
     }
 
-    let n = view.gaussians.len();
-    let Channels {
-        total,
-        colored,
-        stride,
-        ..
-    } = scene.channels;
-    let slot_size = MOMENTS + total;
-    let geometry = !(out.means.is_empty()
-        && out.quats.is_empty()
-        && out.scales.is_empty()
-        && out.opacities.is_empty()
-        && out.viewmat.is_empty());
+    let slots = Slots {
+        values: &gradients.slots,
+        channels: scene.channels,
+    };
+    let (stride, colored) = (scene.channels.stride, scene.channels.colored);
+    let camera = !out.viewmat.is_empty();
+    let geometry = camera
+        || !(out.means.is_empty()
+            && out.quats.is_empty()
+            && out.scales.is_empty()
+            && out.opacities.is_empty());
     if !geometry && (out.colors.is_empty() || colored == 0) {
         return gradients.tiles_skipped;
     }
-    let mut rank_of = vec![u32::MAX; n];
-    for (&id, rank) in state.ids.iter().zip(0..) {
-        rank_of[id as usize] = rank;
-    }
-    let count = n.div_ceil(CHUNK);
+    let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
+    let covers = state.binned.chunks();
+    let positions = &state.binned.bins.positions;
+    let count = covers.len();
     let v_viewmats: Vec<[[T; 4]; 3]> = (
         pieces(out.means, CHUNK, count),
         pieces(out.quats, CHUNK, count),
         pieces(out.scales, CHUNK, count),
         pieces(out.opacities, CHUNK, count),
         pieces(out.colors, CHUNK * stride.max(1), count),
-        rank_of.par_chunks(CHUNK),
+        covers,
     )
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, (means, quats, scales, opacities, colors, ranks))| {
-            let mut v_viewmat = [[T::ZERO; 4]; 3];
-            let mut slot = vec![T::ZERO; slot_size];
-            for (local, &rank) in ranks.iter().enumerate() {
-                if rank == u32::MAX {
+        .map(|(chunk, (means, quats, scales, opacities, colors, cover))| {
+            let mut v = ChunkGradients::new();
+            for local in 0..cover.len() {
+                let own = &positions[cover.pairs_of(local)];
+                if own.is_empty() {
                     continue;
                 }
-                slot.fill(T::ZERO);
-                let own = state.bins.starts[rank as usize]..state.bins.starts[rank as usize + 1];
-                for &position in &state.bins.positions[own.start as usize..own.end as usize] {
-                    let part = &gradients.slots[position as usize * slot_size..][..slot_size];
-                    for (sum, &v) in slot.iter_mut().zip(part) {
-                        *sum += v;
-                    }
-                }
-                if !colors.is_empty() {
-                    for (sum, &v) in colors[local * stride..][..colored]
-                        .iter_mut()
-                        .zip(&slot[MOMENTS..])
-                    {
-                        *sum += v;
-                    }
-                }
-                if !geometry {
-                    continue;
-                }
-                let v_splat = SplatGradient {
-                    h: slot[0],
-                    first: [slot[1], slot[2]],
-                    second: [slot[3], slot[4], slot[5]],
-                    depth: if total > colored {
-                        slot[MOMENTS + colored]
-                    } else {
-                        T::ZERO
-                    },
+                let v_colors = if colors.is_empty() {
+                    &mut []
+                } else {
+                    &mut colors[local * stride..][..colored]
                 };
-                let i = chunk * CHUNK + local;
-                let Some(v) = project_vjp(&view.gaussians, &view.camera, limits, i, &v_splat) else {
-                    continue;
-                };
-                add(means.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.mean);
-                add(quats.get_mut(local).map(<[T; 4]>::as_mut_slice), &v.quat);
-                add(scales.get_mut(local).map(<[T; 3]>::as_mut_slice), &v.scale);
-                add(opacities.get_mut(local..=local), &[v.opacity]);
-                add(Some(v_viewmat.as_flattened_mut()), v.viewmat.as_flattened());
+                v.push(local, slots.sum(own, v_colors));
             }
-            v_viewmat
+            if geometry && v.len > 0 {
+                levels::vjp(level, &view.gaussians, chunk * CHUNK, &lens, camera, &mut v);
+                v.add_to(means, quats, scales, opacities);
+            }
+            v.viewmat
         })
         .collect();
-    if !out.viewmat.is_empty() {
+    if camera {
         for v in &v_viewmats {
-            add(Some(out.viewmat), v.as_flattened());
+            for (sum, &v) in out.viewmat.iter_mut().zip(v.as_flattened()) {
+                *sum += v;
+            }
         }
     }
     gradients.tiles_skipped
 }
 
-#[inline(always)]
-fn add<T: Real>(sums: Option<&mut [T]>, values: &[T]) {
-    if let Some(sums) = sums {
-        for (sum, &value) in sums.iter_mut().zip(values) {
-            *sum += value;
-        }
-    }
-}
-
 /// A rendered image.
 #[derive(Debug)]
-pub struct Frame<T> {
+pub struct Frame<T: Real> {
     /// Rows, columns, channels: the colours, then depth if the mode has it.
     pub colors: Vec<T>,
     /// Rows, columns.

@@ -4,20 +4,25 @@ use crate::camera::Camera;
 use crate::composite::composite;
 use crate::error::RasterError;
 use crate::gaussians::Gaussians;
-use crate::project::{Projected, ScreenInfo, project};
+use crate::pool::Pooled;
+use crate::project::ScreenInfo;
 use crate::real::Real;
-use crate::render::{View, scene};
+use crate::render::{Binned, View, scene};
 use crate::settings::{Limits, RasterSettings, RenderMode};
-use crate::tiles::{TileBins, TileGrid, bin_tiles, sort_by_depth};
+use crate::tiles::{BinScratch, TileGrid};
 
 /// A view taken through the forward stages, each of which can be repeated.
 #[derive(Debug)]
-pub struct Stages<'a, T> {
+pub struct Stages<'a, T: Real> {
     view: View<'a, T>,
     mode: RenderMode,
     limits: Limits<T>,
-    projected: Projected<T>,
-    bins: TileBins,
+    grid: TileGrid,
+    means2d: Vec<[T; 2]>,
+    depths: Vec<T>,
+    radii: Vec<[i32; 2]>,
+    binned: Pooled<Binned<T>>,
+    scratch: Pooled<BinScratch<T>>,
 }
 
 impl<'a, T: Real> Stages<'a, T> {
@@ -32,60 +37,53 @@ impl<'a, T: Real> Stages<'a, T> {
         mode: RenderMode,
     ) -> Result<Self, RasterError> {
         let limits = Limits::new(settings)?;
-        let view = View {
-            gaussians: *gaussians,
-            camera: *camera,
-            background: None,
-            pixel_mask: None,
-        };
-        let projected = project_view(&view, &limits);
-        let bins = bin_tiles(&projected.splats, &grid(&view, &limits), None)?;
-        Ok(Self {
-            view,
+        let n = gaussians.len();
+        let mut stages = Self {
+            view: View {
+                gaussians: *gaussians,
+                camera: *camera,
+                background: None,
+                pixel_mask: None,
+            },
             mode,
             limits,
-            projected,
-            bins,
-        })
+            grid: TileGrid::new(camera.width, camera.height, limits.tile_size),
+            means2d: vec![[T::ZERO; 2]; n],
+            depths: vec![T::ZERO; n],
+            radii: vec![[0; 2]; n],
+            binned: Pooled::take(),
+            scratch: Pooled::take(),
+        };
+        stages.project();
+        stages.bin()?;
+        Ok(stages)
     }
 
-    /// Projects and sorts by depth.
+    /// Projects, and finds the tiles that each splat reaches.
     pub fn project(&mut self) {
-        self.projected = project_view(&self.view, &self.limits);
+        let screen = ScreenInfo {
+            means2d: &mut self.means2d,
+            depths: &mut self.depths,
+            radii: &mut self.radii,
+        };
+        self.binned
+            .project(&self.view, &self.limits, &self.grid, None, screen);
     }
 
-    /// Lists the splats of each tile.
+    /// Sorts by depth and lists the splats of each tile.
     ///
     /// # Errors
     /// [`RasterError::TooManyIntersections`].
     pub fn bin(&mut self) -> Result<(), RasterError> {
-        self.bins = bin_tiles(&self.projected.splats, &grid(&self.view, &self.limits), None)?;
-        Ok(())
+        self.binned.bin(&self.grid, &mut self.scratch)
     }
 
     /// Composites all tiles into an image.
     pub fn composite(&self) -> Vec<T> {
-        let Projected { ids, splats } = &self.projected;
-        let scene = scene(&self.view, self.mode, &self.limits, splats, ids, &self.bins);
-        let pixels = self.view.camera.width * self.view.camera.height;
+        let scene = scene(&self.view, self.mode, &self.limits, &self.binned);
+        let pixels = self.grid.width * self.grid.height;
         let mut colors = vec![T::ZERO; pixels * scene.channels.total];
         composite(&scene, &mut colors, &mut vec![T::ZERO; pixels]);
         colors
     }
-}
-
-fn grid<T: Real>(view: &View<'_, T>, limits: &Limits<T>) -> TileGrid {
-    TileGrid::new(view.camera.width, view.camera.height, limits.tile_size)
-}
-
-fn project_view<T: Real>(view: &View<'_, T>, limits: &Limits<T>) -> Projected<T> {
-    let n = view.gaussians.len();
-    let info = ScreenInfo {
-        means2d: &mut vec![[T::ZERO; 2]; n],
-        depths: &mut vec![T::ZERO; n],
-        radii: &mut vec![[0; 2]; n],
-    };
-    let mut projected = project(&view.gaussians, &view.camera, limits, info);
-    sort_by_depth(&mut projected);
-    projected
 }

@@ -1,9 +1,11 @@
 //! Which tiles see which splats, front to back.
 
+use crate::chunk::CHUNK;
 use crate::error::RasterError;
-use crate::project::{Projected, Splat};
+use crate::pool::{bytes_of, filled, stale};
+use crate::project::Splat;
 use crate::real::Real;
-use crate::sort::radix_sort;
+use crate::sort::{SortScratch, radix_sort_with};
 
 /// How an image is cut into square tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,166 +46,346 @@ impl TileGrid {
     }
 }
 
-/// For every tile the splats that may reach it, front to back. A *rank* is a position in depth order.
-#[derive(Debug)]
-pub(crate) struct TileBins {
-    /// Tile t owns `ranks[offsets[t]..offsets[t + 1]]`.
-    pub(crate) offsets: Vec<u32>,
-    pub(crate) ranks: Vec<u32>,
-    /// The splat of rank r owns `positions[starts[r]..starts[r + 1]]`: where in `ranks` it stands, tile by tile.
-    pub(crate) starts: Vec<u32>,
-    pub(crate) positions: Vec<u32>,
-}
-
-/// Puts the splats in order of depth, ties by index.
-pub(crate) fn sort_by_depth<T: Real>(projected: &mut Projected<T>) {
-    let mut order: Vec<(T::Key, u32)> = projected
-        .splats
-        .iter()
-        .zip(0..)
-        .map(|(splat, i)| (splat.depth.key(), i))
-        .collect();
-    radix_sort(&mut order);
-    projected.ids = order.iter().map(|&(_, i)| projected.ids[i as usize]).collect();
-    projected.splats = order.iter().map(|&(_, i)| projected.splats[i as usize]).collect();
-}
-
 /// A little more than `reach`: culling must never drop a pair that the compositor, rounding differently, would keep.
 #[inline(always)]
 pub(crate) fn padded_reach<T: Real>(reach: T) -> T {
     reach * T::of(1.001) + T::of(0.01)
 }
 
-/// The ellipse {u² + v² ≤ reach} of a splat, ready to be cut by rows of tiles.
-struct Ellipse<T> {
-    x: T,
-    y: T,
-    reach: T,
-    w22: T,
-    /// dx of the middle of a row, per dy.
-    slope: T,
-    inverse_w11: T,
-    /// dy of the rightmost point.
-    right: T,
-    half_height: T,
+/// Tiles next to each other in a row that one splat reaches.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Span {
+    pub(crate) first: u32,
+    pub(crate) count: u32,
 }
 
-impl<T: Real> Ellipse<T> {
-    fn new(splat: &Splat<T>) -> Self {
-        let reach = padded_reach(splat.reach);
-        let (inverse_w11, inverse_w22) = (T::ONE / splat.w11, T::ONE / splat.w22);
-        let tilt = -splat.w12 * inverse_w22;
-        let half_height = reach.sqrt() * inverse_w22;
-        Self {
-            x: splat.x,
-            y: splat.y,
-            reach,
-            w22: splat.w22,
-            slope: -splat.w12 * inverse_w11,
-            inverse_w11,
-            right: half_height * (tilt / (T::ONE + tilt * tilt).sqrt()),
-            half_height,
-        }
-    }
-
-    /// Least and greatest x of the ellipse between two heights.
-    #[inline(always)]
-    fn columns(&self, top: T, bottom: T) -> (T, T) {
-        let low = (top - self.y).greater(-self.half_height);
-        let high = (bottom - self.y).lesser(self.half_height);
-        let half_width = |dy: T| {
-            let v = self.w22 * dy;
-            (self.reach - v * v).greater(T::ZERO).sqrt() * self.inverse_w11
-        };
-        let (left_at, right_at) = ((-self.right).limit(low, high), self.right.limit(low, high));
-        (
-            self.x + self.slope * left_at - half_width(left_at),
-            self.x + self.slope * right_at + half_width(right_at),
-        )
+impl Span {
+    fn tiles(self) -> std::ops::Range<usize> {
+        self.first as usize..(self.first + self.count) as usize
     }
 }
 
-/// First and one-past-last tile along an axis with a pixel centre in [low, high]; empty ranges are (0, 0).
+/// First and one-past-last pixel with its centre in [low, high]; not in order if there is none.
 #[inline(always)]
-fn tile_range<T: Real>(low: T, high: T, tile_size: usize, pixels: usize) -> (usize, usize) {
-    let (half, slack, end) = (T::of(0.5), T::of(0.01), T::of(pixels as f64));
-    // Centre i + ½ is in if low − ½ ≤ i ≤ high − ½. Truncation is the floor, everything being at least 0.
-    let first = (low - half - slack).limit(T::ZERO, end);
-    let whole = first.truncate();
-    let first = whole + usize::from(T::of(whole as f64) < first);
-    let past = (high + half + slack).limit(T::ZERO, end).truncate();
-    if first >= past {
-        return (0, 0);
-    }
-    // Tile sizes are powers of two; a division would cost more than all the rest.
-    let shift = tile_size.trailing_zeros();
-    (first >> shift, ((past - 1) >> shift) + 1)
+pub(crate) fn pixel_range<T: Real>(low: T, high: T, pixels: T) -> (u32, u32) {
+    // Centre i + ½ is in if low − ½ ≤ i ≤ high − ½, with slack; adding not quite 1 to the first rounds up.
+    let (ceiling, slack) = (T::of(0.99), T::of(0.01));
+    let half = T::of(0.5);
+    let first = (low - half - slack + ceiling).limit(T::ZERO, pixels).truncate();
+    let past = (high + half + slack).limit(T::ZERO, pixels).truncate();
+    (first as u32, past as u32)
 }
 
-/// Lists, for every tile for which `wanted` holds, the splats (in depth order) whose ellipse meets it.
-pub(crate) fn bin_tiles<T: Real>(
-    splats: &[Splat<T>],
-    grid: &TileGrid,
-    wanted: Option<&[bool]>,
-) -> Result<TileBins, RasterError> {
-    let mut tiles: Vec<u32> = Vec::with_capacity(splats.len() * 4);
-    let mut starts = Vec::with_capacity(splats.len() + 1);
-    starts.push(0);
-    let mut push_row = |row: usize, (first, last): (usize, usize)| {
-        for tile in row * grid.columns + first..row * grid.columns + last {
-            if wanted.is_none_or(|wanted| wanted[tile]) {
-                tiles.push(tile as u32);
-            }
+/// Rows of tiles waiting to be cut out of ellipses together.
+const ROWS: usize = 64;
+type Column<U> = [U; ROWS];
+
+/// The ellipse {u² + v² ≤ reach} of a splat, ready to be cut by rows of tiles.
+#[derive(Clone, Copy)]
+pub(crate) struct Ellipse<T> {
+    pub(crate) x: T,
+    pub(crate) y: T,
+    pub(crate) reach: T,
+    pub(crate) w22: T,
+    pub(crate) inverse_w11: T,
+    /// dx of the middle of a row, per dy.
+    pub(crate) slope: T,
+    /// dy of the rightmost point.
+    pub(crate) right: T,
+    pub(crate) half_height: T,
+}
+
+/// Cuts ellipses by rows of tiles, many at once.
+pub(crate) struct Cutter<'a, T> {
+    grid: &'a TileGrid,
+    /// Tiles that are wanted; all if absent.
+    wanted: Option<&'a [bool]>,
+    ellipses: [Column<T>; 8],
+    /// Height of each row's first pixel centres.
+    tops: Column<T>,
+    /// First tile of each row.
+    rows: Column<u32>,
+    /// Whose row it is.
+    owners: Column<u32>,
+    used: usize,
+}
+
+impl<'a, T: Real> Cutter<'a, T> {
+    pub(crate) fn new(grid: &'a TileGrid, wanted: Option<&'a [bool]>) -> Self {
+        Self {
+            grid,
+            wanted,
+            ellipses: [[T::ZERO; ROWS]; 8],
+            tops: [T::ZERO; ROWS],
+            rows: [0; ROWS],
+            owners: [0; ROWS],
+            used: 0,
         }
-        tiles.len()
-    };
-    for splat in splats {
-        let mut count = starts[starts.len() - 1] as usize;
-        if splat.reach.is_finite() {
-            let ellipse = Ellipse::new(splat);
-            let (top, bottom) = tile_range(
-                splat.y - ellipse.half_height,
-                splat.y + ellipse.half_height,
-                grid.tile_size,
-                grid.height,
-            );
-            for row in top..bottom {
-                let first_centre = T::of((row * grid.tile_size) as f64 + 0.5);
-                let last_centre = first_centre + T::of(grid.tile_size as f64 - 1.0);
-                let (left, right) = ellipse.columns(first_centre, last_centre);
-                count = push_row(row, tile_range(left, right, grid.tile_size, grid.width));
-            }
-        } else {
-            for row in 0..grid.rows {
-                count = push_row(row, (0, grid.columns));
-            }
-        }
-        starts.push(u32::try_from(count).map_err(|_| RasterError::TooManyIntersections)?);
     }
 
-    // A counting sort by tile keeps the depth order within each.
-    let mut offsets = vec![0u32; grid.len() + 1];
-    for &tile in &tiles {
-        offsets[tile as usize + 1] += 1;
-    }
-    for tile in 0..grid.len() {
-        offsets[tile + 1] += offsets[tile];
-    }
-    let mut next = offsets.clone();
-    let mut ranks = vec![0u32; tiles.len()];
-    let mut positions = vec![0u32; tiles.len()];
-    for rank in 0..splats.len() {
-        for entry in starts[rank] as usize..starts[rank + 1] as usize {
-            let slot = &mut next[tiles[entry] as usize];
-            ranks[*slot as usize] = rank as u32;
-            positions[entry] = *slot;
-            *slot += 1;
+    /// Adds the rows of tiles `rows` of a splat, which must not come before those added earlier.
+    #[inline(always)]
+    pub(crate) fn push(
+        &mut self,
+        owner: usize,
+        ellipse: &Ellipse<T>,
+        rows: std::ops::Range<u32>,
+        cover: &mut Cover,
+    ) {
+        let e = ellipse;
+        let values = [
+            e.x,
+            e.y,
+            e.reach,
+            e.w22,
+            e.inverse_w11,
+            e.slope,
+            e.right,
+            e.half_height,
+        ];
+        for row in rows {
+            if self.used == ROWS {
+                self.flush(cover);
+            }
+            let at = self.used & (ROWS - 1);
+            for (column, value) in self.ellipses.iter_mut().zip(values) {
+                column[at] = value;
+            }
+            self.tops[at] = T::of((row * self.grid.tile_size as u32) as f64 + 0.5);
+            self.rows[at] = row * self.grid.columns as u32;
+            self.owners[at] = owner as u32;
+            self.used += 1;
         }
     }
-    Ok(TileBins {
-        offsets,
-        ranks,
-        starts,
-        positions,
-    })
+
+    /// Writes the spans of the rows that wait.
+    #[inline(always)]
+    pub(crate) fn flush(&mut self, cover: &mut Cover) {
+        let (mut firsts, mut pasts) = ([0u32; ROWS], [0u32; ROWS]);
+        let tall = T::of(self.grid.tile_size as f64 - 1.0);
+        let width = T::of(self.grid.width as f64);
+        // Tile sizes are powers of two; a division would cost more than all the rest.
+        let shift = self.grid.tile_size.trailing_zeros();
+        let [xs, ys, reaches, w22s, inverses, slopes, rights, half_heights] = &self.ellipses;
+        for i in 0..ROWS {
+            let (reach, w22, inverse_w11) = (reaches[i], w22s[i], inverses[i]);
+            let top = self.tops[i] - ys[i];
+            let low = top.greater(-half_heights[i]);
+            let high = (top + tall).lesser(half_heights[i]);
+            let half_width = |dy: T| {
+                let v = w22 * dy;
+                (reach - v * v).greater(T::ZERO).sqrt() * inverse_w11
+            };
+            // The row's extreme points: those of the ellipse, or where its edge leaves the row.
+            let (left_at, right_at) = ((-rights[i]).limit(low, high), rights[i].limit(low, high));
+            let left = xs[i] + slopes[i] * left_at - half_width(left_at);
+            let right = xs[i] + slopes[i] * right_at + half_width(right_at);
+            let (first, past) = pixel_range(left, right, width);
+            firsts[i] = first >> shift;
+            pasts[i] = if first < past {
+                ((past - 1) >> shift) + 1
+            } else {
+                0
+            };
+        }
+        for i in 0..self.used {
+            let (row, owner) = (self.rows[i], self.owners[i] as usize);
+            if pasts[i] <= firsts[i] {
+                continue;
+            }
+            let span = Span {
+                first: row + firsts[i],
+                count: pasts[i] - firsts[i],
+            };
+            match self.wanted {
+                None => cover.push(owner, span),
+                Some(wanted) => {
+                    for tile in span.tiles().filter(|&tile| wanted[tile]) {
+                        cover.push(
+                            owner,
+                            Span {
+                                first: tile as u32,
+                                count: 1,
+                            },
+                        );
+                    }
+                }
+            }
+        }
+        self.used = 0;
+    }
+}
+
+/// Which tiles a chunk of Gaussians reaches.
+#[derive(Debug, Default)]
+pub(crate) struct Cover {
+    /// Gaussian by Gaussian.
+    spans: Vec<Span>,
+    /// Where the spans and the (Gaussian, tile) pairs of each Gaussian of the chunk begin, and where the last end.
+    begins: Vec<[u32; 2]>,
+    /// Gaussians of the chunk that some pixel may see.
+    pub(crate) visible: usize,
+    /// (Gaussian, tile) pairs of all chunks before this one.
+    base: u32,
+}
+
+impl Cover {
+    pub(crate) fn bytes(&self) -> usize {
+        bytes_of(&self.spans) + bytes_of(&self.begins)
+    }
+
+    /// Gaussians in the chunk.
+    pub(crate) fn len(&self) -> usize {
+        self.begins.len() - 1
+    }
+
+    /// Starts over for `len` Gaussians.
+    pub(crate) fn clear(&mut self, len: usize) {
+        self.spans.clear();
+        filled(&mut self.begins, len + 1, [0; 2]);
+    }
+
+    #[inline(always)]
+    fn push(&mut self, owner: usize, span: Span) {
+        self.spans.push(span);
+        let counts = &mut self.begins[owner + 1];
+        *counts = [counts[0] + 1, counts[1].saturating_add(span.count)];
+    }
+
+    /// Turns counts into beginnings.
+    pub(crate) fn finish(&mut self) {
+        let mut sum = [0u32; 2];
+        for begin in &mut self.begins {
+            sum = [sum[0] + begin[0], sum[1].saturating_add(begin[1])];
+            *begin = sum;
+        }
+    }
+
+    /// How many (Gaussian, tile) pairs, at most 2³² − 1.
+    fn pairs(&self) -> u32 {
+        self.begins.last().map_or(0, |begin| begin[1])
+    }
+
+    /// Whether a Gaussian of the chunk reaches any tile.
+    pub(crate) fn reaches(&self, local: usize) -> bool {
+        self.begins[local][0] < self.begins[local + 1][0]
+    }
+
+    fn spans_of(&self, local: usize) -> &[Span] {
+        &self.spans[self.begins[local][0] as usize..self.begins[local + 1][0] as usize]
+    }
+
+    /// Where a Gaussian's own part of [`TileBins::positions`] is.
+    #[inline(always)]
+    pub(crate) fn pairs_of(&self, local: usize) -> std::ops::Range<usize> {
+        (self.base + self.begins[local][1]) as usize..(self.base + self.begins[local + 1][1]) as usize
+    }
+}
+
+/// For every tile the splats that may reach it, front to back.
+#[derive(Debug, Default)]
+pub(crate) struct TileBins {
+    /// Tile t owns `ranks[offsets[t]..offsets[t + 1]]`.
+    pub(crate) offsets: Vec<u32>,
+    /// Indices of Gaussians.
+    pub(crate) ranks: Vec<u32>,
+    /// Gaussian by Gaussian and tile by tile: where in `ranks` it stands.
+    pub(crate) positions: Vec<u32>,
+}
+
+impl TileBins {
+    pub(crate) fn bytes(&self) -> usize {
+        bytes_of(&self.offsets) + bytes_of(&self.ranks) + bytes_of(&self.positions)
+    }
+}
+
+/// What sorting and binning need besides their results.
+#[derive(Debug)]
+pub(crate) struct BinScratch<T: Real> {
+    order: Vec<(T::Key, u32)>,
+    sort: SortScratch<T::Key>,
+    next: Vec<u32>,
+}
+
+impl<T: Real> Default for BinScratch<T> {
+    fn default() -> Self {
+        Self {
+            order: Vec::new(),
+            sort: SortScratch::default(),
+            next: Vec::new(),
+        }
+    }
+}
+
+impl<T: Real> BinScratch<T> {
+    pub(crate) fn bytes(&self) -> usize {
+        bytes_of(&self.order) + self.sort.bytes() + bytes_of(&self.next)
+    }
+}
+
+/// Puts the Gaussians that reach some tile in order of depth, ties by index.
+pub(crate) fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut BinScratch<T>) {
+    scratch.order.clear();
+    for (chunk, (splats, cover)) in splats.chunks(CHUNK).zip(covers).enumerate() {
+        let first = (chunk * CHUNK) as u32;
+        let reached = splats
+            .iter()
+            .enumerate()
+            .filter(|&(local, _)| cover.reaches(local));
+        scratch
+            .order
+            .extend(reached.map(|(local, splat)| (splat.depth.key(), first + local as u32)));
+    }
+    radix_sort_with(&mut scratch.order, &mut scratch.sort);
+}
+
+/// Counts the pairs of every tile, and numbers those of every Gaussian.
+pub(crate) fn count_pairs(
+    covers: &mut [Cover],
+    tiles: usize,
+    bins: &mut TileBins,
+) -> Result<(), RasterError> {
+    let mut total = 0u32;
+    for cover in covers.iter_mut() {
+        cover.base = total;
+        total = total
+            .checked_add(cover.pairs())
+            .ok_or(RasterError::TooManyIntersections)?;
+    }
+    if total == u32::MAX {
+        return Err(RasterError::TooManyIntersections);
+    }
+    let offsets = filled(&mut bins.offsets, tiles + 1, 0);
+    for span in covers.iter().flat_map(|cover| &cover.spans) {
+        for count in &mut offsets[1..][span.tiles()] {
+            *count += 1;
+        }
+    }
+    let mut sum = 0;
+    for offset in offsets {
+        sum += *offset;
+        *offset = sum;
+    }
+    Ok(())
+}
+
+/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_pairs`].
+pub(crate) fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut BinScratch<T>, bins: &mut TileBins) {
+    let pairs = bins.offsets.last().map_or(0, |&end| end as usize);
+    let ranks = stale(&mut bins.ranks, pairs);
+    let positions = stale(&mut bins.positions, pairs);
+    scratch.next.clear();
+    scratch.next.extend_from_slice(&bins.offsets);
+    for &(_, i) in &scratch.order {
+        let (cover, local) = (&covers[i as usize / CHUNK], i as usize % CHUNK);
+        let mut own = positions[cover.pairs_of(local)].iter_mut();
+        for span in cover.spans_of(local) {
+            // The span first: taking from the other first would lose a position.
+            for (slot, position) in scratch.next[span.tiles()].iter_mut().zip(&mut own) {
+                ranks[*slot as usize] = i;
+                *position = *slot;
+                *slot += 1;
+            }
+        }
+    }
 }

@@ -1,0 +1,125 @@
+//! Compiles the loops of `chunk` once per CPU feature level and picks the best at run time, as `dispatch` does for the
+//! compositor.
+//!
+//! The arithmetic is the same at every level, down to the bit: these loops fuse no multiplication with an addition.
+
+use crate::chunk::{ChunkGradients, ChunkSplats, project_chunk, vjp_chunk};
+use crate::dispatch::SimdLevel;
+use crate::gaussians::Gaussians;
+use crate::project::Lens;
+use crate::real::Real;
+use crate::tiles::TileGrid;
+
+macro_rules! compiled_for {
+    ($module:ident, $features:literal) => {
+        #[cfg(target_arch = "x86_64")]
+        mod $module {
+            use super::*;
+
+            #[target_feature(enable = $features)]
+            pub(super) fn project<T: Real, const ANTIALIASED: bool>(
+                gaussians: &Gaussians<'_, T>,
+                first: usize,
+                lens: &Lens<T>,
+                grid: &TileGrid,
+                wanted: Option<&[bool]>,
+                out: ChunkSplats<'_, T>,
+            ) {
+                project_chunk::<T, ANTIALIASED>(gaussians, first, lens, grid, wanted, out);
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn vjp<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
+                gaussians: &Gaussians<'_, T>,
+                first: usize,
+                lens: &Lens<T>,
+                chunk: &mut ChunkGradients<T>,
+            ) {
+                vjp_chunk::<T, ANTIALIASED, CAMERA>(gaussians, first, lens, chunk);
+            }
+        }
+    };
+}
+compiled_for!(avx2, "avx2,fma,bmi1,bmi2,popcnt,lzcnt");
+compiled_for!(
+    avx512,
+    "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma,bmi1,bmi2,popcnt,lzcnt"
+);
+
+#[allow(unsafe_code)]
+fn project_level<T: Real, const ANTIALIASED: bool>(
+    level: SimdLevel,
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    grid: &TileGrid,
+    wanted: Option<&[bool]>,
+    out: ChunkSplats<'_, T>,
+) {
+    match level {
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe {
+            avx2::project::<T, ANTIALIASED>(gaussians, first, lens, grid, wanted, out)
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe {
+            avx512::project::<T, ANTIALIASED>(gaussians, first, lens, grid, wanted, out);
+        },
+        _ => project_chunk::<T, ANTIALIASED>(gaussians, first, lens, grid, wanted, out),
+    }
+}
+
+#[allow(unsafe_code)]
+fn vjp_level<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
+    level: SimdLevel,
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    chunk: &mut ChunkGradients<T>,
+) {
+    match level {
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe { avx2::vjp::<T, ANTIALIASED, CAMERA>(gaussians, first, lens, chunk) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe { avx512::vjp::<T, ANTIALIASED, CAMERA>(gaussians, first, lens, chunk) },
+        _ => vjp_chunk::<T, ANTIALIASED, CAMERA>(gaussians, first, lens, chunk),
+    }
+}
+
+/// [`project_chunk`] on this machine.
+pub(crate) fn project<T: Real>(
+    level: SimdLevel,
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    grid: &TileGrid,
+    wanted: Option<&[bool]>,
+    out: ChunkSplats<'_, T>,
+) {
+    if lens.antialiased() {
+        project_level::<T, true>(level, gaussians, first, lens, grid, wanted, out);
+    } else {
+        project_level::<T, false>(level, gaussians, first, lens, grid, wanted, out);
+    }
+}
+
+/// [`vjp_chunk`] on this machine; the camera's part only if asked for.
+pub(crate) fn vjp<T: Real>(
+    level: SimdLevel,
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    camera: bool,
+    chunk: &mut ChunkGradients<T>,
+) {
+    match (lens.antialiased(), camera) {
+        (false, false) => vjp_level::<T, false, false>(level, gaussians, first, lens, chunk),
+        (false, true) => vjp_level::<T, false, true>(level, gaussians, first, lens, chunk),
+        (true, false) => vjp_level::<T, true, false>(level, gaussians, first, lens, chunk),
+        (true, true) => vjp_level::<T, true, true>(level, gaussians, first, lens, chunk),
+    }
+}
