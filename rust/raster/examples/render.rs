@@ -161,7 +161,7 @@ impl Options {
         let (width, height) = (self.size.0 as f32, self.size.1 as f32);
         let half_angle = (self.fov.to_radians() / 2.0).tan() * (width / height).min(1.0);
         // A little more than touches the border; a scene that is one point is seen from 1 away.
-        let distance = 1.1 * radius / half_angle.atan().sin() / self.zoom;
+        let distance = 1.25 * radius / half_angle.atan().sin() / self.zoom;
         Orbit {
             centre: self.centre.unwrap_or(middle),
             distance: if distance > 0.0 { distance } else { 1.0 },

@@ -53,7 +53,7 @@ fn floor(splats: &mut Splats, side: usize) {
             }
             let dark = ((x / 0.3).floor() + (z / 0.3).floor()).rem_euclid(2.0) < 1.0;
             let rgb = [if dark { 0.35 } else { 0.8 }; 3];
-            let radius = 0.55 * step;
+            let radius = 0.65 * step;
             let up = [0.0, -1.0, 0.0];
             splats.push([x, FLOOR, z], facing(up), [radius, radius, 0.001], 0.95, rgb);
         }
