@@ -155,6 +155,34 @@ fn text_files_with_extra_properties_are_read_and_the_right_way_up() {
 }
 
 #[test]
+fn harmonics_change_with_the_side_they_are_seen_from() {
+    // Grey, but green grows along −y and red along z: seen from below (y) green is bright, from behind (−z) red.
+    let mut properties = PROPERTIES.map(String::from).to_vec();
+    properties.extend((0..9).map(|i| format!("float f_rest_{i}")));
+    let properties: Vec<&str> = properties.iter().map(String::as_str).collect();
+    let row = "0 0 0 7 0 0 0 0 9 -1 -1 -1 1 0 0 0  0 1 0  1 0 0  0 0 0";
+    let ply = write_ascii("harmonics.ply", &properties, &[row]);
+    let middle = |axes: [&str; 4]| {
+        let out = temporary("harmonics.png");
+        let common = [&ply, "--size", "21x21", "--out", &out, "--up"];
+        run_render(&[&common[..], &axes[..1], &["--azimuth", axes[1], axes[2], axes[3]]].concat()).unwrap();
+        Shown::of(&out).pixel(10, 10)
+    };
+    let below = middle(["y", "0", "--elevation", "90"]);
+    let above = middle(["y", "0", "--elevation", "-90"]);
+    assert!(
+        below[1] > 200 && above[1] < 50 && below[0].abs_diff(above[0]) < 3,
+        "{below:?} {above:?}"
+    );
+    let behind = middle(["z", "0", "--elevation", "-90"]);
+    let before = middle(["z", "0", "--elevation", "90"]);
+    assert!(
+        behind[0] > 200 && before[0] < 50 && behind[2].abs_diff(before[2]) < 3,
+        "{behind:?} {before:?}"
+    );
+}
+
+#[test]
 fn turntables_are_animations_or_folders() {
     let ply = write_ascii("turn.ply", &PROPERTIES, &ROWS);
     let (animation, folder) = (temporary("turn.png"), temporary("turn"));

@@ -79,7 +79,7 @@ impl Workload {
             let mut part = || 0.25 * normal_number(&mut rng);
             let quat = [1.0 + part(), part(), part(), part()];
             let scale = [1.0, 1.0, 0.2].map(|flat| flat * (0.08 + 0.22 * rng.f32()));
-            let opacity = 0.005 + 0.025 * rng.f32();
+            let opacity = 0.01 + 0.05 * rng.f32();
             workload.push(mean, quat, scale, opacity, &mut rng);
         }
         workload

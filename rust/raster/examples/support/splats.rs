@@ -1,6 +1,6 @@
 //! Gaussians that own their arrays, and where a camera should stand to see them.
 
-use bigs_raster::{Gaussians, RasterError};
+use bigs_raster::{Gaussians, Harmonics, RasterError};
 
 /// The constant real spherical harmonic.
 const SH_C0: f32 = 0.282_094_79;
@@ -41,14 +41,21 @@ impl Splats {
         self.harmonics.push(rgb.map(|v| (v - 0.5) / SH_C0));
     }
 
-    /// Red, green and blue per Gaussian.
-    pub(crate) fn colors(&self) -> Vec<f32> {
-        let per_splat = (self.degree + 1).pow(2);
-        self.harmonics
+    /// Red, green and blue per Gaussian, as seen from a place.
+    pub(crate) fn colors(&self, eye: [f32; 3]) -> Result<Vec<f32>, RasterError> {
+        let directions: Vec<[f32; 3]> = self
+            .means
             .iter()
-            .step_by(per_splat)
-            .flat_map(|constant| constant.map(|v| (0.5 + SH_C0 * v).max(0.0)))
-            .collect()
+            .map(|mean| [0, 1, 2].map(|axis| mean[axis] - eye[axis]))
+            .collect();
+        let bases = (self.degree + 1).pow(2);
+        let coefficients = self.harmonics.as_flattened();
+        let values = Harmonics::new(self.degree, bases, &directions, coefficients, None)?.evaluate();
+        Ok(values
+            .into_flattened()
+            .into_iter()
+            .map(|v| (v + 0.5).max(0.0))
+            .collect())
     }
 
     /// What the renderer takes.
