@@ -21,7 +21,7 @@ __all__ = [
 
 __version__: str
 
-# Every array is [entries or 1, cameras or 1, ...], C-contiguous and of one floating dtype:
+# Every array is C-contiguous and of one floating dtype, with leading axes that `counts` says the meaning of:
 # means [.., N, 3], quats [.., N, 4], scales [.., N, 3], opacities [.., N], colors [.., N, D],
 # viewmats [.., 4, 4], Ks [.., 3, 3], backgrounds [.., D] or None, pixel_mask [.., H, W] of bool or None.
 _Arrays = tuple[
@@ -36,6 +36,9 @@ _Arrays = tuple[
     NDArray[np.bool_] | None,
 ]
 
+# Of each array, batch entries and cameras that its leading axes stand for; 1 is shared, or absent.
+_Counts = tuple[tuple[int, int], ...]
+
 @final
 class RasterState:
     """What the forward pass keeps for the backward pass. Opaque; usable any number of times."""
@@ -45,25 +48,28 @@ class RasterState:
 
 def rasterize_forward(
     arrays: _Arrays,
+    counts: _Counts,
+    lead: tuple[int, ...],
     width: int,
     height: int,
     settings: RasterSettings,
     render_mode: str,
     camera_model: str,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.int32], RasterState]:
-    """Colors [V, H, W, D], alphas [V, H, W, 1], means2d [V, N, 2], depths [V, N], radii [V, N, 2], state."""
+    """Colors [*lead, H, W, D], alphas [.., H, W, 1], means2d [.., N, 2], depths [.., N], radii, state."""
 
 def rasterize_backward(
     state: RasterState,
     arrays: _Arrays,
+    counts: _Counts,
     width: int,
     height: int,
     settings: RasterSettings,
     render_mode: str,
     camera_model: str,
-    v_colors: NDArray[Any],
-    v_alphas: NDArray[Any],
-    wanted: list[bool],
+    v_colors: NDArray[Any] | None,
+    v_alphas: NDArray[Any] | None,
+    wanted: tuple[bool, ...],
 ) -> tuple[
     NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int
 ]:

@@ -74,7 +74,11 @@ def rasterization(
     Returns:
         Colors [..., C, H, W, D], with depth as the last channel where asked for, alphas [..., C, H, W, 1] and
         info: means2d [..., C, N, 2] and radii [..., C, N, 2] in pixels, depths [..., C, N] (zeros for a
-        Gaussian that no pixel sees), tile_size, and from the rust backend n_isects, n_visible, n_empty_tiles.
+        Gaussian that no pixel sees), tile_size. The rust backend adds gsplat's tile_width, tile_height,
+        width, height, n_cameras, n_batches, and counts of its work, summed over the images: n_isects pairs of
+        Gaussian and tile, n_visible and n_culled Gaussians that some or no pixel can see, n_empty_tiles that
+        no Gaussian reaches or that pixel_mask closes, and after a backward pass n_tiles_without_gradient,
+        reached by Gaussians but not by a gradient. What is culled, empty or without gradient is skipped.
 
     Raises:
         InputError: a shape, dtype, value or camera that cannot be rendered.
@@ -99,12 +103,13 @@ def rasterization(
         check_choice("sh_degree", sh_degree, sh.DEGREES)
         sh.check_coefficients("colors", sh_degree, colors)
     batch = _batch_of(tensors, pixel_mask, width, height, sh_degree)
-    _check_cameras(viewmats, Ks)
     if backend == "auto":
         backend = "gsplat" if means.is_cuda else "rust"
     if backend == "rust":
         if means.is_cuda:
             raise InputError("means: expected CPU tensors for backend 'rust', found a CUDA tensor")
+        if sh_degree is not None:
+            _check_cameras(viewmats, Ks)
         try:
             return _render_rust(
                 *_with_view_colors(tensors, batch, sh.spherical_harmonics),
@@ -115,9 +120,11 @@ def rasterization(
             )
         except ValueError as error:
             # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
+            _check_cameras(viewmats, Ks)
             for name, tensor in tensors.items():
                 check_finite(name, tensor)
             raise InputError(str(error)) from None
+    _check_cameras(viewmats, Ks)
     for name, tensor in tensors.items():
         check_finite(name, tensor)
     expanded = _expanded(tensors, batch)
@@ -207,14 +214,21 @@ def _batch_of(
     if colors_per_camera:
         check_shape("colors", tensors["colors"], [None] * depth + [cameras, n, *color])
         leading["colors"] = leading["colors"][:-1]
+    shape = _broadcast(leading)
+    if 0 in shape:
+        raise InputError(f"batch axes: expected at least one entry, found {list(shape)}")
+    return _Batch(shape, cameras, int(width), int(height), colors_per_camera, sh_degree)
+
+
+def _broadcast(leading: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
+    different = {axes for axes in leading.values() if axes}
+    if len(different) <= 1:  # the usual case; torch takes longer to say so
+        return different.pop() if different else ()
     try:
-        shape = torch.broadcast_shapes(*leading.values())
+        return tuple(torch.broadcast_shapes(*leading.values()))
     except RuntimeError:
         found = ", ".join(f"{name} {list(axes)}" for name, axes in leading.items())
         raise InputError(f"batch axes: expected shapes that broadcast, found {found}") from None
-    if 0 in shape:
-        raise InputError(f"batch axes: expected at least one entry, found {list(shape)}")
-    return _Batch(tuple(shape), cameras, int(width), int(height), colors_per_camera, sh_degree)
 
 
 def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
@@ -254,16 +268,6 @@ def _with_view_colors(
     return {**tensors, "colors": colors}, batch._replace(colors_per_camera=True, sh_degree=None)
 
 
-def _slabs(tensor: torch.Tensor, batch: tuple[int, ...], axes: int, camera_axis: bool) -> torch.Tensor:
-    """The tensor as [entries or 1, cameras or 1, ...]; `axes` counts its own axes without the camera's."""
-    lead = tuple(tensor.shape[: tensor.ndim - axes - camera_axis])
-    own = tensor.shape[len(lead) :]
-    if math.prod(lead) != 1 and lead != batch:
-        tensor = tensor.expand(*batch, *own)
-        lead = batch
-    return tensor.reshape(math.prod(lead), *(own if camera_axis else (1, *own)))
-
-
 def _render_rust(
     tensors: dict[str, torch.Tensor],
     batch: _Batch,
@@ -272,28 +276,41 @@ def _render_rust(
     render_mode: RenderMode,
     camera_model: CameraModel,
 ) -> RenderOutput:
-    def slabs(name: str, axes: int, camera_axis: bool = False) -> torch.Tensor:
-        return _slabs(tensors[name], batch.shape, axes, camera_axis)
-
-    inputs = (
-        slabs("means", 2),
-        slabs("quats", 2),
-        slabs("scales", 2),
-        slabs("opacities", 1),
-        slabs("colors", 2, batch.colors_per_camera),
-        slabs("viewmats", 2, True),
-        slabs("backgrounds", 1, True) if "backgrounds" in tensors else None,
+    # Axes of each input's own, in the engine's order, and whether the camera's comes before them.
+    axes = {
+        "means": (2, False),
+        "quats": (2, False),
+        "scales": (2, False),
+        "opacities": (1, False),
+        "colors": (2, batch.colors_per_camera),
+        "viewmats": (2, True),
+        "Ks": (2, True),
+        "backgrounds": (1, True),
+        "pixel_mask": (2, True),
+    }
+    entries = math.prod(batch.shape)
+    inputs, counts = [], []
+    for name, (own, camera_axis) in axes.items():
+        tensor = pixel_mask if name == "pixel_mask" else tensors.get(name)
+        count = 1
+        if tensor is not None:
+            lead = tensor.shape[: tensor.ndim - own - camera_axis]
+            count = math.prod(lead)
+            if count != 1 and lead != batch.shape:
+                tensor = tensor.expand(*batch.shape, *tensor.shape[len(lead) :])
+                count = entries
+        inputs.append(tensor)
+        counts.append((count, batch.cameras if camera_axis and tensor is not None else 1))
+    call = rust.Call(
+        tuple(counts),
+        (*batch.shape, batch.cameras),
+        batch.width,
+        batch.height,
+        settings,
+        render_mode,
+        camera_model,
     )
-    mask = None if pixel_mask is None else _slabs(pixel_mask, batch.shape, 2, True)
-    colors, alphas, info = rust.rasterize(
-        inputs, slabs("Ks", 2, True), mask, batch.width, batch.height, settings, render_mode, camera_model
-    )
-    lead = (*batch.shape, batch.cameras)
-    for name in ("means2d", "depths", "radii"):
-        info[name] = info[name].reshape(*lead, *info[name].shape[1:])
-    return RenderOutput(
-        colors.reshape(*lead, *colors.shape[1:]), alphas.reshape(*lead, *alphas.shape[1:]), info
-    )
+    return RenderOutput(*rust.rasterize(tuple(inputs), call))
 
 
 def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torch.Tensor]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,16 +12,23 @@ from torch.autograd.function import once_differentiable
 import bigs._raster as _raster
 from bigs.raster.settings import RasterSettings
 
-# The differentiable inputs, in the order of the engine's arrays; there Ks follows viewmats.
-Inputs = tuple[
-    torch.Tensor,  # means [S, 1, N, 3]
-    torch.Tensor,  # quats [S, 1, N, 4]
-    torch.Tensor,  # scales [S, 1, N, 3]
-    torch.Tensor,  # opacities [S, 1, N]
-    torch.Tensor,  # colors [S, C or 1, N, D]
-    torch.Tensor,  # viewmats [S, C, 4, 4]
-    torch.Tensor | None,  # backgrounds [S, C, D]
-]
+# In the engine's order: means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, pixel_mask.
+# The first six and backgrounds are differentiable; the last two may be absent.
+Inputs = tuple[torch.Tensor | None, ...]
+
+
+class Call(NamedTuple):
+    """What the engine is told besides the arrays."""
+
+    counts: tuple[tuple[int, int], ...]
+    """Of each input, how many batch entries and cameras (or 1: shared) its leading axes stand for."""
+    lead: tuple[int, ...]
+    """Leading axes of the images: the batch, then the cameras."""
+    width: int
+    height: int
+    settings: RasterSettings
+    render_mode: str
+    camera_model: str
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
@@ -29,87 +36,80 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _engine_arrays(inputs: Sequence[torch.Tensor | None], constants: Sequence[torch.Tensor | None]) -> Any:
-    *gaussians_and_views, backgrounds = inputs
-    Ks, pixel_mask = constants
-    tensors = (*gaussians_and_views, Ks, backgrounds, pixel_mask)
-    return tuple(None if tensor is None else _array(tensor) for tensor in tensors)
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        constants: tuple[torch.Tensor, torch.Tensor | None],
-        call: tuple[int, int, RasterSettings, str, str],
-        info: dict[str, Any],
-        *inputs: torch.Tensor | None,
+        ctx: Any, call: Call, info: dict[str, Any], *inputs: torch.Tensor | None
     ) -> tuple[torch.Tensor, ...]:
-        *outputs, state = _raster.rasterize_forward(_engine_arrays(inputs, constants), *call)
-        info.update(state.counters())
+        arrays: Any = tuple(None if tensor is None else _array(tensor) for tensor in inputs)
+        *outputs, state = _raster.rasterize_forward(arrays, *call)
         colors, alphas, means2d, depths, radii = map(torch.from_numpy, outputs)
-        ctx.save_for_backward(*inputs, *constants)
-        ctx.call, ctx.state, ctx.info, ctx.image_shape = call, state, info, colors.shape
-        ctx.mark_non_differentiable(means2d, depths, radii)
+        info.update(state.counters(), depths=depths, radii=radii)
+        # Saved to notice inputs changed in place before the backward pass; what it reads are the arrays.
+        ctx.save_for_backward(*inputs)
+        ctx.call, ctx.arrays, ctx.state, ctx.info = call, arrays, state, info
+        ctx.mark_non_differentiable(means2d)
         ctx.set_materialize_grads(False)
-        return colors, alphas, means2d, depths, radii
+        return colors, alphas, means2d
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: torch.Tensor | None, v_alphas: torch.Tensor | None, *_: Any) -> tuple:
-        *inputs, Ks, pixel_mask = ctx.saved_tensors
-        if v_colors is None:
-            v_colors = inputs[0].new_zeros(ctx.image_shape)
-        if v_alphas is None:
-            v_alphas = v_colors.new_zeros(*ctx.image_shape[:-1], 1)
-        wanted = list(ctx.needs_input_grad[3:])
-        width, height, settings, render_mode, camera_model = ctx.call
-        *gradients, tiles_skipped = _raster.rasterize_backward(
+        inputs = ctx.saved_tensors
+        *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[2:]
+        call: Call = ctx.call
+        *gradients, v_backgrounds, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
-            _engine_arrays(inputs, (Ks, pixel_mask)),
-            width,
-            height,
-            settings,
-            render_mode,
-            camera_model,
-            _array(v_colors),
-            _array(v_alphas),
-            wanted,
+            ctx.arrays,
+            call.counts,
+            call.width,
+            call.height,
+            call.settings,
+            call.render_mode,
+            call.camera_model,
+            None if v_colors is None else _array(v_colors),
+            None if v_alphas is None else _array(v_alphas),
+            (*six, backgrounds),
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
-        return None, None, None, *map(_gradient_of, inputs, wanted, map(torch.from_numpy, gradients))
+        return (
+            None,
+            None,
+            *map(_gradient_of, inputs, six, gradients),
+            None,
+            _gradient_of(inputs[7], backgrounds, v_backgrounds),
+            None,
+        )
 
 
-def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: torch.Tensor) -> torch.Tensor | None:
+def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: np.ndarray) -> torch.Tensor | None:
     if tensor is None or not wanted:
         return None
-    if gradient.numel() == tensor.numel():
-        return gradient.reshape(tensor.shape)
+    flat = torch.from_numpy(gradient)
+    if flat.numel() == tensor.numel():
+        return flat.view(tensor.shape)
     # Of a world-to-camera matrix the engine returns three rows; the last is constant.
-    rows = gradient.reshape(*tensor.shape[:-2], 3, 4)
+    rows = flat.view(*tensor.shape[:-2], 3, 4)
     return torch.cat([rows, torch.zeros_like(rows[..., :1, :])], dim=-2)
 
 
-def rasterize(
-    inputs: Inputs,
-    Ks: torch.Tensor,
-    pixel_mask: torch.Tensor | None,
-    width: int,
-    height: int,
-    settings: RasterSettings,
-    render_mode: str,
-    camera_model: str,
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Render checked inputs whose leading axes are [entries or 1, cameras or 1].
+def rasterize(inputs: Inputs, call: Call) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Render inputs whose shapes fit.
 
     Returns:
-        Colors [V, H, W, D], alphas [V, H, W, 1] and info, V being entries × cameras.
+        Colors [..., C, H, W, D], alphas [..., C, H, W, 1] and info.
 
     Raises:
         ValueError: a value that is not finite, a camera that is none, a setting out of range.
     """
-    info: dict[str, Any] = {"tile_size": settings.tile_size}
-    call = (width, height, settings, render_mode, camera_model)
-    outputs = _Rasterize.apply((Ks, pixel_mask), call, info, *inputs)
-    colors, alphas, info["means2d"], info["depths"], info["radii"] = outputs
+    info: dict[str, Any] = {
+        "tile_size": call.settings.tile_size,
+        "tile_width": -(-call.width // call.settings.tile_size),
+        "tile_height": -(-call.height // call.settings.tile_size),
+        "width": call.width,
+        "height": call.height,
+        "n_cameras": call.lead[-1],
+        "n_batches": math.prod(call.lead[:-1]),
+    }
+    colors, alphas, info["means2d"] = _Rasterize.apply(call, info, *inputs)
     return colors, alphas, info

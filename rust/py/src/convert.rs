@@ -2,8 +2,7 @@
 
 use bigs_raster::{BatchInputs, BatchShape, CameraModel, Real, Slabs};
 use numpy::{
-    Element, IntoPyArray, PyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
-    PyUntypedArrayMethods,
+    Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -20,8 +19,12 @@ pub(crate) fn slice<'py, T: Element>(
     Ok(array.readonly())
 }
 
+/// How many slabs an array holds: entries, cameras.
+pub(crate) type Count = (usize, usize);
+
 /// The arrays of a call, borrowed for as long as this lives.
 pub(crate) struct Arrays<'py, T: Element> {
+    counts: [Count; NAMES.len() + 2],
     floats: Vec<PyReadonlyArrayDyn<'py, T>>,
     backgrounds: Option<PyReadonlyArrayDyn<'py, T>>,
     pixel_mask: Option<PyReadonlyArrayDyn<'py, bool>>,
@@ -39,7 +42,7 @@ const NAMES: [&str; 7] = [
 
 impl<'py, T: Real + Element> Arrays<'py, T> {
     /// Reads (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds | None, pixel_mask | None).
-    pub(crate) fn extract(arrays: &Bound<'py, PyTuple>) -> PyResult<Self> {
+    pub(crate) fn extract(arrays: &Bound<'py, PyTuple>, counts: [Count; NAMES.len() + 2]) -> PyResult<Self> {
         if arrays.len() != NAMES.len() + 2 {
             return Err(PyTypeError::new_err("arrays: expected nine entries"));
         }
@@ -49,6 +52,7 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
                 .map(|item| (!item.is_none()).then_some(item))
         };
         Ok(Self {
+            counts,
             floats: NAMES
                 .iter()
                 .enumerate()
@@ -65,7 +69,9 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
         (width, height): (usize, usize),
         camera_model: CameraModel,
     ) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
-        let slabs = |index: usize| slabs(NAMES[index], &self.floats[index]);
+        let slabs = |index: usize| slabs(NAMES[index], &self.floats[index], self.counts[index]);
+        let backgrounds = self.backgrounds.as_ref();
+        let pixel_mask = self.pixel_mask.as_ref();
         let inputs = BatchInputs {
             means: slabs(0)?,
             quats: slabs(1)?,
@@ -75,42 +81,20 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
             viewmats: slabs(5)?,
             ks: slabs(6)?,
             camera_model,
-            backgrounds: self
-                .backgrounds
-                .as_ref()
-                .map(|a| self::slabs("backgrounds", a))
+            backgrounds: backgrounds
+                .map(|a| self::slabs("backgrounds", a, self.counts[7]))
                 .transpose()?,
-            pixel_mask: self
-                .pixel_mask
-                .as_ref()
-                .map(|a| self::slabs("pixel_mask", a))
+            pixel_mask: pixel_mask
+                .map(|a| self::slabs("pixel_mask", a, self.counts[8]))
                 .transpose()?,
         };
-        let floats = [
-            inputs.means,
-            inputs.quats,
-            inputs.scales,
-            inputs.opacities,
-            inputs.colors,
-            inputs.viewmats,
-            inputs.ks,
-        ];
-        let optional = [
-            inputs.backgrounds.map(|s| (s.entries, s.cameras)),
-            inputs.pixel_mask.map(|s| (s.entries, s.cameras)),
-        ];
-        let sizes = floats
-            .iter()
-            .map(|s| (s.entries, s.cameras))
-            .chain(optional.into_iter().flatten());
-        let (entries, cameras) = sizes.fold((1, 1), |a, b| (wider(a.0, b.0), wider(a.1, b.1)));
         let last = |index: usize, from_end: usize| {
             let shape = self.floats[index].shape();
-            shape[shape.len() - from_end]
+            shape.len().checked_sub(from_end).map_or(0, |axis| shape[axis])
         };
         let shape = BatchShape {
-            entries,
-            cameras,
+            entries: self.counts.iter().fold(1, |size, count| wider(size, count.0)),
+            cameras: self.counts.iter().fold(1, |size, count| wider(size, count.1)),
             gaussians: last(0, 2),
             channels: last(4, 1),
             width,
@@ -125,37 +109,30 @@ fn wider(a: usize, b: usize) -> usize {
     if a == 1 { b } else { a }
 }
 
-fn slabs<'a, U: Element>(name: &str, array: &'a PyReadonlyArrayDyn<'_, U>) -> PyResult<Slabs<'a, U>> {
-    let shape = array.shape();
-    if shape.len() < 3 {
-        return Err(PyValueError::new_err(format!(
-            "{name}: expected axes for entries and cameras, found shape {shape:?}"
-        )));
-    }
+fn slabs<'a, U: Element>(
+    name: &str,
+    array: &'a PyReadonlyArrayDyn<'_, U>,
+    (entries, cameras): Count,
+) -> PyResult<Slabs<'a, U>> {
     let data = array
         .as_slice()
         .map_err(|_| PyValueError::new_err(format!("{name}: expected a C-contiguous array")))?;
     Ok(Slabs {
         data,
-        entries: shape[0],
-        cameras: shape[1],
+        entries,
+        cameras,
     })
 }
 
-/// Shape of an output.
-pub(crate) type Shape<const N: usize> = [usize; N];
-
-/// Hands a vector over to numpy.
-pub(crate) fn array<'py, U: Element, const N: usize>(
+/// Hands a vector over to numpy, in the shape `lead` + `own`.
+pub(crate) fn array<'py, U: Element>(
     py: Python<'py>,
     values: Vec<U>,
-    shape: Shape<N>,
-) -> PyResult<Bound<'py, PyAny>>
-where
-    [usize; N]: numpy::ndarray::IntoDimension,
-{
-    let flat: Bound<'py, PyArray<U, _>> = values.into_pyarray(py);
-    Ok(flat.reshape(shape)?.into_any())
+    lead: &[usize],
+    own: &[usize],
+) -> PyResult<Bound<'py, PyAny>> {
+    let shape: Vec<usize> = lead.iter().chain(own).copied().collect();
+    Ok(values.into_pyarray(py).reshape(shape)?.into_any())
 }
 
 /// Hands a flat gradient over to numpy.

@@ -11,7 +11,7 @@ use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
-use crate::convert::{Arrays, array, gradient, slice};
+use crate::convert::{Arrays, Count, array, gradient, slice};
 
 /// What the forward pass keeps for the backward pass. Opaque; usable any number of times.
 #[pyclass(frozen, module = "bigs._raster")]
@@ -114,23 +114,25 @@ fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + 
 fn forward<'py, T: Scalar>(
     py: Python<'py>,
     arrays: &Arrays<'py, T>,
+    lead: &[usize],
     (width, height): (usize, usize),
     settings: &RasterSettings,
     (mode, camera_model): (RenderMode, CameraModel),
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (shape, inputs) = arrays.inputs((width, height), camera_model)?;
     let (images, state) = run(py, || Batch::new(shape, inputs, settings, mode)?.render())?;
-    let (views, n) = (shape.views(), shape.gaussians);
+    let n = shape.gaussians;
     (
         array(
             py,
             images.colors,
-            [views, height, width, shape.image_channels(mode)],
+            lead,
+            &[height, width, shape.image_channels(mode)],
         )?,
-        array(py, images.alphas, [views, height, width, 1])?,
-        array(py, images.means2d.into_flattened(), [views, n, 2])?,
-        array(py, images.depths, [views, n])?,
-        array(py, images.radii.into_flattened(), [views, n, 2])?,
+        array(py, images.alphas, lead, &[height, width, 1])?,
+        array(py, images.means2d.into_flattened(), lead, &[n, 2])?,
+        array(py, images.depths, lead, &[n])?,
+        array(py, images.radii.into_flattened(), lead, &[n, 2])?,
         RasterState { kept: T::keep(state) },
     )
         .into_pyobject(py)
@@ -138,15 +140,19 @@ fn forward<'py, T: Scalar>(
 
 /// Renders a batch.
 ///
-/// Every array is `[entries or 1, cameras or 1, ...]`, C-contiguous, float32 or float64 throughout:
+/// Every array is C-contiguous, float32 or float64 throughout; `counts` says of each how many batch entries and cameras
+/// (or 1: shared) its leading axes stand for. Images have the leading axes `lead`.
+///
 /// means `[.., N, 3]`, quats `[.., N, 4]`, scales `[.., N, 3]`, opacities `[.., N]`, colors `[.., N, D]`,
 /// viewmats `[.., 4, 4]`, Ks `[.., 3, 3]`, backgrounds `[.., D]` or None, pixel_mask `[.., H, W]` or None.
 ///
-/// Returns (colors, alphas, means2d, depths, radii, state), views first. Raises ValueError.
+/// Returns (colors, alphas, means2d, depths, radii, state). Raises ValueError.
 #[pyfunction]
 fn rasterize_forward<'py>(
     py: Python<'py>,
     arrays: &Bound<'py, PyTuple>,
+    counts: [Count; 9],
+    lead: Vec<usize>,
     width: usize,
     height: usize,
     settings: Settings,
@@ -155,9 +161,16 @@ fn rasterize_forward<'py>(
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, size) = (settings.into(), (width, height));
     let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
-    match Arrays::<f32>::extract(arrays) {
-        Ok(single) => forward(py, &single, size, &settings, mode),
-        Err(_) => forward(py, &Arrays::<f64>::extract(arrays)?, size, &settings, mode),
+    match Arrays::<f32>::extract(arrays, counts) {
+        Ok(single) => forward(py, &single, &lead, size, &settings, mode),
+        Err(_) => forward(
+            py,
+            &Arrays::<f64>::extract(arrays, counts)?,
+            &lead,
+            size,
+            &settings,
+            mode,
+        ),
     }
 }
 
@@ -168,15 +181,14 @@ fn backward<'py, T: Scalar>(
     (width, height): (usize, usize),
     settings: &RasterSettings,
     (mode, camera_model): (RenderMode, CameraModel),
-    (v_colors, v_alphas): (&Bound<'py, PyAny>, &Bound<'py, PyAny>),
+    [v_colors, v_alphas]: [Option<&Bound<'py, PyAny>>; 2],
     wanted: Wanted,
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (shape, inputs) = arrays.inputs((width, height), camera_model)?;
-    let (v_colors, v_alphas) = (
-        slice::<T>("v_colors", v_colors)?,
-        slice::<T>("v_alphas", v_alphas)?,
-    );
-    let (v_colors, v_alphas) = (v_colors.as_slice()?, v_alphas.as_slice()?);
+    let v_colors = v_colors.map(|v| slice::<T>("v_colors", v)).transpose()?;
+    let v_alphas = v_alphas.map(|v| slice::<T>("v_alphas", v)).transpose()?;
+    let v_colors = v_colors.as_ref().map(|v| v.as_slice()).transpose()?;
+    let v_alphas = v_alphas.as_ref().map(|v| v.as_slice()).transpose()?;
     let gradients = run(py, || {
         Batch::new_trusted(shape, inputs, settings, mode)?.render_vjp(state, v_colors, v_alphas, wanted)
     })?;
@@ -195,19 +207,20 @@ fn backward<'py, T: Scalar>(
 
 /// Gradients of means, quats, scales, opacities, colors, viewmats (three rows of four) and backgrounds, flat, in the
 /// layout of their input, and the number of tiles without incoming gradient. `wanted` has one flag per input; what is
-/// not wanted is an empty array. Takes the inputs of the forward call that made `state`.
+/// not wanted is an empty array. Gradients of the images may be None for zeros. Takes the inputs of the forward call that made `state`.
 #[pyfunction]
 fn rasterize_backward<'py>(
     py: Python<'py>,
     state: &Bound<'py, RasterState>,
     arrays: &Bound<'py, PyTuple>,
+    counts: [Count; 9],
     width: usize,
     height: usize,
     settings: Settings,
     render_mode: &str,
     camera_model: &str,
-    v_colors: &Bound<'py, PyAny>,
-    v_alphas: &Bound<'py, PyAny>,
+    v_colors: Option<&Bound<'py, PyAny>>,
+    v_alphas: Option<&Bound<'py, PyAny>>,
     wanted: [bool; 7],
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, size) = (settings.into(), (width, height));
@@ -222,12 +235,12 @@ fn rasterize_backward<'py>(
         viewmats,
         backgrounds,
     };
-    let (v, kept) = ((v_colors, v_alphas), &state.get().kept);
+    let (v, kept) = ([v_colors, v_alphas], &state.get().kept);
     if let Some(state) = f32::kept(kept) {
         backward(
             py,
             state,
-            &Arrays::extract(arrays)?,
+            &Arrays::extract(arrays, counts)?,
             size,
             &settings,
             mode,
@@ -238,7 +251,7 @@ fn rasterize_backward<'py>(
         backward(
             py,
             state,
-            &Arrays::extract(arrays)?,
+            &Arrays::extract(arrays, counts)?,
             size,
             &settings,
             mode,
@@ -263,6 +276,7 @@ impl RasterState {
         let dict = PyDict::new(py);
         dict.set_item("n_isects", counters.intersections)?;
         dict.set_item("n_visible", counters.visible)?;
+        dict.set_item("n_culled", counters.culled)?;
         dict.set_item("n_empty_tiles", counters.empty_tiles)?;
         Ok(dict)
     }

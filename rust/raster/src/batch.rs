@@ -6,6 +6,7 @@ use crate::camera::{Camera, CameraModel, Intrinsics};
 use crate::composite::Cotangents;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
+use crate::pool::{Buffers, Pooled, bytes_of};
 use crate::project::ScreenInfo;
 use crate::real::Real;
 use crate::render::{Image, View, ViewGradients, ViewState, render_view, render_view_vjp};
@@ -194,6 +195,25 @@ pub struct BatchGradients<T> {
     pub tiles_skipped: usize,
 }
 
+/// Nothing but zeros, for gradients that nobody gave.
+#[derive(Debug, Default)]
+struct Zeros<T>(Vec<T>);
+
+impl<T: Real> Zeros<T> {
+    fn of(&mut self, len: usize) -> &[T] {
+        if self.0.len() < len {
+            self.0.resize(len, T::ZERO);
+        }
+        &self.0[..len]
+    }
+}
+
+impl<T: Real> Buffers for Zeros<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.0)
+    }
+}
+
 /// Whether the values of a batch's inputs are known to be finite.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Values {
@@ -271,6 +291,11 @@ impl<'a, T: Real> Batch<'a, T> {
             .map(|view| {
                 let viewmat = inputs.viewmats.slab(view, shape.cameras);
                 let k = inputs.ks.slab(view, shape.cameras);
+                if [k[1], k[3], k[6], k[7], k[8] - T::ONE] != [T::ZERO; 5] {
+                    return Err(RasterError::BadCamera {
+                        reason: "expected a camera matrix without skew and with 0 0 1 as its last row",
+                    });
+                }
                 let intrinsics = Intrinsics {
                     fx: k[0],
                     fy: k[4],
@@ -352,20 +377,30 @@ impl<'a, T: Real> Batch<'a, T> {
         Ok((images, BatchState { views: states }))
     }
 
-    /// Gradients of a loss, given its gradients with respect to the colours and alphas of [`Batch::render`].
+    /// Gradients of a loss, given its gradients with respect to the colours and alphas of [`Batch::render`]; `None`
+    /// stands for zeros.
     ///
     /// # Errors
     /// Gradients whose length is not that of the images.
     pub fn render_vjp(
         &self,
         state: &BatchState<T>,
-        v_colors: &[T],
-        v_alphas: &[T],
+        v_colors: Option<&[T]>,
+        v_alphas: Option<&[T]>,
         wanted: Wanted,
     ) -> Result<BatchGradients<T>, RasterError> {
         let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
         let total = self.shape.image_channels(self.mode);
-        check_length("v_colors", views * pixels * total, v_colors.len())?;
+        let mut zeros = Pooled::<Zeros<T>>::take();
+        let v_colors_size = views * pixels * total;
+        let zeros = zeros.of(match (v_colors, v_alphas) {
+            (None, _) => v_colors_size.max(views * pixels),
+            (_, None) => views * pixels,
+            _ => 0,
+        });
+        let v_colors = v_colors.unwrap_or_else(|| &zeros[..v_colors_size]);
+        let v_alphas = v_alphas.unwrap_or_else(|| &zeros[..views * pixels]);
+        check_length("v_colors", v_colors_size, v_colors.len())?;
         check_length("v_alphas", views * pixels, v_alphas.len())?;
 
         // One slab per view, summed where views share an input.
