@@ -17,6 +17,7 @@ __all__ = [
     "rasterize_backward",
     "rasterize_forward",
     "simd_level",
+    "time_engine",
 ]
 
 __version__: str
@@ -94,3 +95,17 @@ def simd_level() -> str:
 
 def fma_peak_gflops() -> float:
     """Measured peak of one thread at that level, 10⁹ float32 operations per second; a multiply-add is two."""
+
+def time_engine(
+    gaussians: list[NDArray[np.float32]],
+    camera: list[NDArray[np.float32]],
+    width: int,
+    height: int,
+    settings: RasterSettings,
+    v_colors: NDArray[np.float32],
+) -> list[tuple[str, float]]:
+    """Wall seconds of the stages project, bin and composite, then of the whole calls forward and backward.
+
+    Gaussians are means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3]; the camera is
+    viewmat [4, 4] and K [3, 3]; v_colors [H, W, 3]. All are float32 and C-contiguous.
+    """

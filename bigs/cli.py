@@ -1,4 +1,4 @@
-"""The command line: demo, info, reconstruct, eval, render, export. Only this file prints or exits."""
+"""The command line: demo, info, reconstruct, eval, render, export, bench. Only this file prints or exits."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import tyro
 from rich.console import Console
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 # The names of `train.presets.PRESETS`, spelled out because importing those takes seconds; a test compares.
 Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 Format = Literal["ply", "poses", "challenge", "mesh", "hand-meshes"]
+# Likewise those of `bench.workloads.KINDS`, `bench.plan.PARTS` and `bench.peers.PEERS`.
+Workload = Literal["A", "B", "C", "D"]
+Part = Literal["levels", "stages", "memory", "skips", "curve", "peers"]
+Peer = Literal["gsplat"]
 
 _out = Console()
 _err = Console(stderr=True)
@@ -139,14 +143,66 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
         _out.print(str(path), markup=False, highlight=False, soft_wrap=True)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
+def bench_engine(
+    out: Path = Path("bench"),
+    workloads: tuple[Workload, ...] = ("A", "B", "C", "D"),
+    parts: tuple[Part, ...] = ("levels", "stages", "memory", "skips", "curve", "peers"),
+    peers: tuple[Peer, ...] = ("gsplat",),
+    threads: tuple[int, ...] = (1, 2),
+    repeats: int = 15,
+    budget: float = 20.0,
+    scale: float = 1.0,
+    seed: int = 0,
+) -> None:
+    """Time the splatting engine and its peers, with errors, and draw the curve of time against error.
+
+    Args:
+        out: folder for engine.md, engine.json and engine.png.
+        workloads: hand and object isotropic (A) and flat (B), dense scene (C), faint pile (D); taken from the
+            folder that BIGS_BENCH names if it is set.
+        parts: what to measure beside plain times.
+        peers: other renderers to time in the same run, where they are installed.
+        threads: numbers of threads.
+        repeats: alternating runs of everything, of which the median counts.
+        budget: seconds after which one variant of a workload is not run again.
+        scale: of the number of Gaussians and of pixels; 0.01 takes seconds.
+        seed: of the workloads.
+    """
+    from bigs.commands.bench import bench_engine as run
+
+    with _err.status("starting") as status:
+        tables = run(
+            out,
+            workloads,
+            seed=seed,
+            scale=scale,
+            threads=threads,
+            parts=parts,
+            peers=peers,
+            repeats=repeats,
+            budget=budget,
+            listen=status.update,
+        )
+    for table in tables:
+        _out.print(f"\n{table.title}", markup=False, highlight=False)
+        _print_table(table.rows)
+        _out.print(table.note, markup=False, highlight=False)
+    _out.print(f"results in {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+Commands = Mapping[str, "Callable[..., None] | Commands"]
+
+COMMANDS: Commands = {
     "demo": demo,
     "info": info,
     "reconstruct": reconstruct,
     "eval": evaluate,
     "render": render,
     "export": export,
+    "bench": {"engine": bench_engine},
 }
+# What the help says of commands that have commands of their own.
+GROUPS = {"bench": "Measure how fast and how exact this is."}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -167,18 +223,11 @@ def main(arguments: list[str] | None = None) -> None:
 def _parse(arguments: list[str] | None) -> Callable[[], None]:
     """The command that the arguments ask for, ready to run; unknown options are refused in one line."""
 
-    def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-        @functools.wraps(command)
-        def bind(*args: object, **kwargs: object) -> Callable[[], None]:
-            return functools.partial(command, *args, **kwargs)
-
-        return bind
-
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.extras.subcommand_cli_from_dict(
-                {name: deferred(command) for name, command in COMMANDS.items()},
+            return tyro.cli(
+                _choice_of(COMMANDS),
                 prog="bigs",
                 description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU.",
                 args=arguments,
@@ -190,6 +239,28 @@ def _parse(arguments: list[str] | None) -> Callable[[], None]:
         words = " ".join(re.sub(r"[╭╮╰╯│─]+", " ", said.getvalue()).split())
         _fail(words, 2)
         raise
+
+
+def _choice_of(commands: Commands) -> Any:
+    """The type from which the parser makes one of the commands, ready to run."""
+
+    def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        @functools.wraps(command)
+        def bind(*args: object, **kwargs: object) -> Callable[[], None]:
+            return functools.partial(command, *args, **kwargs)
+
+        return bind
+
+    # A union has at least two members; the one that says nothing is hidden.
+    options: list[Any] = [Annotated[None, tyro.conf.Suppress]]
+    for name, command in commands.items():
+        if callable(command):
+            choice = tyro.conf.subcommand(name=name, constructor=deferred(command))
+        else:
+            inner = functools.partial(_choice_of, command)
+            choice = tyro.conf.subcommand(name=name, description=GROUPS[name], constructor_factory=inner)
+        options.append(Annotated[Any, choice])
+    return Union[tuple(options)]  # noqa: UP007
 
 
 def _fail(message: str, code: int) -> None:
@@ -229,6 +300,8 @@ def _print_table(rows: list[tuple[str, ...]]) -> None:
 
     heading, *body = rows
     table = Table(*heading)
+    for column in table.columns:
+        column.overflow = "fold"
     for column in table.columns[1:]:
         column.justify = "right"
     for row in body:

@@ -12,7 +12,10 @@ from command_line import Answer, assert_refused, run_bigs
 from bigs.checks import InputError
 
 
-@pytest.mark.parametrize("command", ["", "demo", "info", "reconstruct", "eval", "render", "export"])
+@pytest.mark.parametrize(
+    "command",
+    ["", "demo", "info", "reconstruct", "eval", "render", "export", "bench", "bench engine"],
+)
 def test_help(call: Callable[..., Answer], command: str) -> None:
     answer = call(*command.split(), "--help")
     assert answer.code == 0
@@ -26,8 +29,10 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "export": "hand-meshes",
         "eval": "gt.npz",
         "info": "HANDS-challenge build folder",
+        "bench": "Measure how fast",
+        "bench engine": "runs of everything",
     }
-    for word in [expected[command]] if command else expected:
+    for word in [expected[command]] if command else [name for name in expected if " " not in name]:
         assert word in text
 
 
@@ -40,6 +45,8 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         ("reconstruct CLIP --out OUT --threads two", ["--threads"]),
         ("reconstruct CLIP --out OUT --threads -1", ["--threads", "expected 0", "found -1"]),
         ("frobnicate", ["frobnicate"]),
+        ("bench", ["engine"]),
+        ("bench frobnicate", ["frobnicate", "engine"]),
         ("", ["demo"]),
         ("export RUN --format fbx", ["fbx", "--format", "ply"]),
     ],

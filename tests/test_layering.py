@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "models": BELOW | {"geometry", "hand", "fields"},
     "train": BELOW | {"bigs", "geometry", "raster", "hand", "fields", "losses", "data", "metrics", "models"},
 }
+MAY_IMPORT["bench"] = BELOW | {"bigs", "raster", "_raster"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT) - {"_raster"}
 MAY_IMPORT["cli"] = {"bigs", "types", "checks", "commands", "train"}
 

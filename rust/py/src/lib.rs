@@ -309,5 +309,6 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(measure::simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(sh::harmonics_forward, m)?)?;
     m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
-    m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)
+    m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
+    m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }

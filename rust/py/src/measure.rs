@@ -1,6 +1,15 @@
-//! What a benchmark asks of the machine.
+//! What a benchmark asks of the engine without numpy or torch in between.
 
+use std::hint::black_box;
+use std::time::Instant;
+
+use bigs_raster::stages::Stages;
+use bigs_raster::{Camera, Gaussians, Intrinsics, RasterError, RenderMode, Renderer};
+use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+
+use crate::{Settings, run, value_error};
 
 /// The CPU feature level the kernels run at: avx512, avx2, neon or baseline.
 #[pyfunction]
@@ -12,4 +21,92 @@ pub(crate) fn simd_level() -> &'static str {
 #[pyfunction]
 pub(crate) fn fma_peak_gflops(py: Python<'_>) -> f64 {
     py.detach(bigs_raster::peak::fma_peak_gflops)
+}
+
+type Array<'py> = PyReadonlyArrayDyn<'py, f32>;
+
+/// Wall seconds of one pass: the stages project, bin and composite, then the whole calls forward and backward.
+///
+/// means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]`, opacities `[N]`, colors `[N, 3]`, viewmat `[4, 4]`, K `[3, 3]`,
+/// v_colors `[H, W, 3]`: float32, C-contiguous. Raises ValueError.
+#[pyfunction]
+pub(crate) fn time_engine<'py>(
+    py: Python<'py>,
+    gaussians: [Array<'py>; 5],
+    camera: [Array<'py>; 2],
+    width: usize,
+    height: usize,
+    settings: Settings,
+    v_colors: Array<'py>,
+) -> PyResult<Vec<(&'static str, f64)>> {
+    let [means, quats, scales, opacities, colors] = &gaussians;
+    let gaussians = Gaussians::new(
+        rows("means", means)?,
+        rows("quats", quats)?,
+        rows("scales", scales)?,
+        opacities.as_slice()?,
+        colors.as_slice()?,
+        3,
+    )
+    .map_err(value_error)?;
+    let [viewmat, k] = &camera;
+    let (viewmat, k) = (rows::<4>("viewmat", viewmat)?, rows::<3>("K", k)?);
+    let (&[row0, row1, row2, row3], &[[fx, _, cx], [_, fy, cy], _]) = (viewmat, k) else {
+        return Err(PyValueError::new_err(
+            "camera: expected viewmat [4, 4] and K [3, 3]",
+        ));
+    };
+    let intrinsics = Intrinsics { fx, fy, cx, cy };
+    let camera = Camera::new([row0, row1, row2, row3], intrinsics, width, height).map_err(value_error)?;
+    let v_colors = v_colors.as_slice()?;
+    run(py, || timed(&gaussians, &camera, &settings.into(), v_colors))
+}
+
+fn timed(
+    gaussians: &Gaussians<'_, f32>,
+    camera: &Camera<f32>,
+    settings: &bigs_raster::RasterSettings,
+    v_colors: &[f32],
+) -> Result<Vec<(&'static str, f64)>, RasterError> {
+    let mut clock = Instant::now();
+    let mut lap = || {
+        let seconds = clock.elapsed().as_secs_f64();
+        clock = Instant::now();
+        seconds
+    };
+    let mut stages = Stages::new(gaussians, camera, settings, RenderMode::Rgb)?;
+    lap();
+    stages.project();
+    let project = lap();
+    stages.bin()?;
+    let bin = lap();
+    black_box(stages.composite());
+    let composite = lap();
+    drop(stages);
+
+    let renderer = Renderer::new(settings, RenderMode::Rgb)?;
+    lap();
+    let frame = renderer.render(gaussians, camera, None)?;
+    let forward = lap();
+    let v_alphas = vec![0.0; frame.alphas.len()];
+    lap();
+    black_box(renderer.render_vjp(gaussians, camera, None, &frame, v_colors, &v_alphas)?);
+    let backward = lap();
+    Ok(vec![
+        ("project", project),
+        ("bin", bin),
+        ("composite", composite),
+        ("forward", forward),
+        ("backward", backward),
+    ])
+}
+
+fn rows<'a, const D: usize>(name: &str, array: &'a Array<'_>) -> PyResult<&'a [[f32; D]]> {
+    match array.as_slice()?.as_chunks() {
+        (rows, []) => Ok(rows),
+        _ => Err(PyValueError::new_err(format!(
+            "{name}: expected rows of {D} values, found shape {:?}",
+            array.shape()
+        ))),
+    }
 }

@@ -1,0 +1,1 @@
+"""Measuring: workloads, timed calls in processes of their own, errors, tables. Nothing here prints."""
