@@ -72,9 +72,17 @@ def rasterize_backward(
     v_alphas: NDArray[Any] | None,
     wanted: tuple[bool, ...],
 ) -> tuple[
-    NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    int,
 ]:
-    """Flat gradients of the seven differentiable inputs and the number of tiles without incoming gradient."""
+    """Flat gradients of the seven differentiable inputs and of means2d; how many tiles had no gradient."""
 
 # dirs [.., N, 3], coeffs [N, K, 3], mask [.., N] of bool or None: all Gaussians of one place, then the next.
 _HarmonicsArrays = tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]

@@ -15,6 +15,7 @@ from bigs.types import RenderOutput
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 CameraModel = Literal["pinhole", "ortho"]
+Means2d = rust.Means2d
 Backend = Literal["auto", "rust", "torch", "gsplat"]
 
 # A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
@@ -38,6 +39,7 @@ def rasterization(
     sh_degree: int | None = None,
     render_mode: RenderMode = "RGB",
     camera_model: CameraModel = "pinhole",
+    means2d: Means2d = "values",
     backend: Backend = "auto",
 ) -> RenderOutput:
     """Render 3D Gaussians (paper Eq. 1 and 2) into C cameras, differentiably.
@@ -68,6 +70,9 @@ def rasterization(
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
         camera_model: "pinhole", or "ortho": parallel rays, x = fx X + cx with fx in pixels per metre. Depth
             is camera z in both, and so are the near and the far plane.
+        means2d: what `info["means2d"]` is: mere "values", or a part of the graph that has a `.grad` (per pixel)
+            after `retain_grad()`, as densification needs: "full", or "packed" [nnz, 2] without those that no
+            pixel sees. Backend "torch" has values only.
         backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,
             gsplat for CUDA tensors.
 
@@ -86,6 +91,7 @@ def rasterization(
     settings = RasterSettings() if settings is None else settings
     check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("camera_model", camera_model, ("pinhole", "ortho"))
+    check_choice("means2d", means2d, ("values", "full", "packed"))
     check_choice("backend", backend, ("auto", "rust", "torch", "gsplat"))
     tensors = {
         "means": means,
@@ -117,6 +123,7 @@ def rasterization(
                 settings,
                 render_mode,
                 camera_model,
+                means2d,
             )
         except ValueError as error:
             # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
@@ -132,9 +139,19 @@ def rasterization(
     if backend == "gsplat":
         return RenderOutput(
             *cuda.rasterize(
-                expanded, mask, batch.width, batch.height, settings, render_mode, camera_model, sh_degree
+                expanded,
+                mask,
+                batch.width,
+                batch.height,
+                settings,
+                render_mode,
+                camera_model,
+                sh_degree,
+                packed=means2d == "packed",
             )
         )
+    if means2d != "values":
+        raise InputError(f"means2d: expected 'values' for backend 'torch', found '{means2d}'")
     return _render_torch(
         *_with_view_colors(expanded, batch, reference.harmonics), mask, settings, render_mode, camera_model
     )
@@ -275,6 +292,7 @@ def _render_rust(
     settings: RasterSettings,
     render_mode: RenderMode,
     camera_model: CameraModel,
+    means2d: Means2d,
 ) -> RenderOutput:
     # Axes of each input's own, in the engine's order, and whether the camera's comes before them.
     axes = {
@@ -310,7 +328,7 @@ def _render_rust(
         render_mode,
         camera_model,
     )
-    return RenderOutput(*rust.rasterize(tuple(inputs), call))
+    return RenderOutput(*rust.rasterize(tuple(inputs), call, means2d))
 
 
 def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torch.Tensor]:
@@ -359,7 +377,8 @@ def _render_torch(
     lead = (*batch.shape, batch.cameras)
     images, alphas, infos = zip(*results, strict=True)
     info = {
-        name: torch.stack([i[name] for i in infos]).reshape(*lead, *infos[0][name].shape) for name in infos[0]
+        name: torch.stack([i[name].detach() for i in infos]).reshape(*lead, *infos[0][name].shape)
+        for name in infos[0]
     }
     return RenderOutput(
         torch.stack(images).reshape(*lead, *images[0].shape),

@@ -35,6 +35,8 @@ def rasterize(
     render_mode: str,
     camera_model: str,
     sh_degree: int | None,
+    *,
+    packed: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render checked inputs with equal batch axes, by the names of `bigs.raster.rasterization`.
 
@@ -64,7 +66,7 @@ def rasterize(
         render_mode=render_mode,
         camera_model=camera_model,
         sh_degree=sh_degree,
-        packed=False,
+        packed=packed,
     )
     if pixel_mask is not None:
         inside = pixel_mask[..., None]

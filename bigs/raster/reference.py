@@ -160,11 +160,14 @@ def _project(
         "depths": torch.zeros(len(means), dtype=means.dtype, device=means.device),
         "radii": torch.zeros(len(means), 2, dtype=torch.int32, device=means.device),
     }
-    info["means2d"][ids[order]] = means2d[order].detach()
+    info["means2d"] = info["means2d"].index_put((ids[order],), means2d[order])
     info["depths"][ids[order]] = z[order].detach()
     info["radii"][ids[order]] = radii[order].detach().ceil().clamp(max=2.0**31 - 128).int()
     order = order[torch.argsort(z[order], stable=True)]
-    return _Screen(means2d[order], covs2d[order], z[order], visible_opacities[order], ids[order]), info
+    # From info, so that a caller can ask for the gradient of the centres.
+    return _Screen(
+        info["means2d"][ids[order]], covs2d[order], z[order], visible_opacities[order], ids[order]
+    ), info
 
 
 def _composite(

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
 import bigs._raster as _raster
+from bigs.raster import screen
 from bigs.raster.settings import RasterSettings
 
 # In the engine's order: means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, pixel_mask.
 # The first six and backgrounds are differentiable; the last two may be absent.
 Inputs = tuple[torch.Tensor | None, ...]
+
+# Whether info's means2d are mere values or a tensor of the graph: of all Gaussians, or of those seen.
+Means2d = Literal["values", "full", "packed"]
 
 
 class Call(NamedTuple):
@@ -37,28 +41,32 @@ def _array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class _Rasterize(torch.autograd.Function):
+    """Images that the engine has rendered, as a function of what it rendered them from."""
+
     @staticmethod
     def forward(
-        ctx: Any, call: Call, info: dict[str, Any], *inputs: torch.Tensor | None
-    ) -> tuple[torch.Tensor, ...]:
-        arrays: Any = tuple(None if tensor is None else _array(tensor) for tensor in inputs)
-        *outputs, state = _raster.rasterize_forward(arrays, *call)
-        colors, alphas, means2d, depths, radii = map(torch.from_numpy, outputs)
-        info.update(state.counters(), depths=depths, radii=radii)
+        ctx: Any,
+        images: tuple[torch.Tensor, torch.Tensor],
+        state: _raster.RasterState,
+        arrays: Any,
+        call: Call,
+        info: dict[str, Any],
+        means2d: torch.Tensor | None,
+        *inputs: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         # Saved to notice inputs changed in place before the backward pass; what it reads are the arrays.
-        ctx.save_for_backward(*inputs)
+        ctx.save_for_backward(means2d, *inputs)
         ctx.call, ctx.arrays, ctx.state, ctx.info = call, arrays, state, info
-        ctx.mark_non_differentiable(means2d)
         ctx.set_materialize_grads(False)
-        return colors, alphas, means2d
+        return images
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_colors: torch.Tensor | None, v_alphas: torch.Tensor | None, *_: Any) -> tuple:
-        inputs = ctx.saved_tensors
-        *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[2:]
+    def backward(ctx: Any, v_colors: torch.Tensor | None, v_alphas: torch.Tensor | None) -> tuple:
+        means2d, *inputs = ctx.saved_tensors
+        want_means2d, *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[5:]
         call: Call = ctx.call
-        *gradients, v_backgrounds, tiles_skipped = _raster.rasterize_backward(
+        *gradients, v_backgrounds, v_means2d, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
             ctx.arrays,
             call.counts,
@@ -69,12 +77,12 @@ class _Rasterize(torch.autograd.Function):
             call.camera_model,
             None if v_colors is None else _array(v_colors),
             None if v_alphas is None else _array(v_alphas),
-            (*six, backgrounds),
+            (*six, backgrounds, want_means2d),
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
         return (
-            None,
-            None,
+            *[None] * 5,
+            _gradient_of(means2d, want_means2d, v_means2d),
             *map(_gradient_of, inputs, six, gradients),
             None,
             _gradient_of(inputs[7], backgrounds, v_backgrounds),
@@ -93,7 +101,9 @@ def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: np.ndarray
     return torch.cat([rows, torch.zeros_like(rows[..., :1, :])], dim=-2)
 
 
-def rasterize(inputs: Inputs, call: Call) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+def rasterize(
+    inputs: Inputs, call: Call, means2d: Means2d = "values"
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render inputs whose shapes fit.
 
     Returns:
@@ -102,6 +112,9 @@ def rasterize(inputs: Inputs, call: Call) -> tuple[torch.Tensor, torch.Tensor, d
     Raises:
         ValueError: a value that is not finite, a camera that is none, a setting out of range.
     """
+    arrays: Any = tuple(None if tensor is None else _array(tensor) for tensor in inputs)
+    *outputs, state = _raster.rasterize_forward(arrays, *call)
+    colors, alphas, centres, depths, radii = map(torch.from_numpy, outputs)
     info: dict[str, Any] = {
         "tile_size": call.settings.tile_size,
         "tile_width": -(-call.width // call.settings.tile_size),
@@ -110,6 +123,16 @@ def rasterize(inputs: Inputs, call: Call) -> tuple[torch.Tensor, torch.Tensor, d
         "height": call.height,
         "n_cameras": call.lead[-1],
         "n_batches": math.prod(call.lead[:-1]),
+        "means2d": centres,
+        "depths": depths,
+        "radii": radii,
+        **state.counters(),
     }
-    colors, alphas, info["means2d"] = _Rasterize.apply(call, info, *inputs)
-    return colors, alphas, info
+    between = None
+    if means2d != "values":
+        seen = depths > 0
+        packed = screen.centres(centres, seen, inputs[0], inputs[5], inputs[6], call.camera_model)
+        between = screen.everywhere(packed, seen)
+        info["means2d"] = packed if means2d == "packed" else between
+    images = _Rasterize.apply((colors, alphas), state, arrays, call, info, between, *inputs)
+    return *images, info

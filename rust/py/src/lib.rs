@@ -200,14 +200,17 @@ fn backward<'py, T: Scalar>(
         gradient(py, gradients.colors),
         gradient(py, gradients.viewmats),
         gradient(py, gradients.backgrounds),
+        gradient(py, gradients.means2d),
         gradients.tiles_skipped,
     )
         .into_pyobject(py)
 }
 
 /// Gradients of means, quats, scales, opacities, colors, viewmats (three rows of four) and backgrounds, flat, in the
-/// layout of their input, and the number of tiles without incoming gradient. `wanted` has one flag per input; what is
-/// not wanted is an empty array. Gradients of the images may be None for zeros. Takes the inputs of the forward call that made `state`.
+/// layout of their input, of means2d `[views, N, 2]`, and the number of tiles without incoming gradient. `wanted` has
+/// one flag per array; what is not wanted is an empty one. Where means2d is wanted, what passes through it is left out
+/// of means and viewmats. Gradients of the images may be None for zeros. Takes the inputs of the forward call that made
+/// `state`.
 #[pyfunction]
 fn rasterize_backward<'py>(
     py: Python<'py>,
@@ -221,11 +224,20 @@ fn rasterize_backward<'py>(
     camera_model: &str,
     v_colors: Option<&Bound<'py, PyAny>>,
     v_alphas: Option<&Bound<'py, PyAny>>,
-    wanted: [bool; 7],
+    wanted: [bool; 8],
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, size) = (settings.into(), (width, height));
     let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
-    let [means, quats, scales, opacities, colors, viewmats, backgrounds] = wanted;
+    let [
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        backgrounds,
+        means2d,
+    ] = wanted;
     let wanted = Wanted {
         means,
         quats,
@@ -234,6 +246,8 @@ fn rasterize_backward<'py>(
         colors,
         viewmats,
         backgrounds,
+        means2d,
+        detach_means2d: means2d,
     };
     let (v, kept) = ([v_colors, v_alphas], &state.get().kept);
     if let Some(state) = f32::kept(kept) {

@@ -176,6 +176,9 @@ pub struct Wanted {
     pub colors: bool,
     pub viewmats: bool,
     pub backgrounds: bool,
+    pub means2d: bool,
+    /// Leave what passes through `means2d` out of the other gradients, for a caller that sends it on.
+    pub detach_means2d: bool,
 }
 
 /// Gradients of a batch's inputs, each in the layout of its input; empty if not asked for. A shared input has the sum
@@ -191,6 +194,8 @@ pub struct BatchGradients<T> {
     /// Three rows of four per matrix: the last row of a world-to-camera matrix is constant.
     pub viewmats: Vec<T>,
     pub backgrounds: Vec<T>,
+    /// Of the centres on screen: views, Gaussians, x and y per pixel.
+    pub means2d: Vec<T>,
     /// Tiles of all views whose incoming gradient was zero.
     pub tiles_skipped: usize,
 }
@@ -412,6 +417,7 @@ impl<'a, T: Real> Batch<'a, T> {
         let mut colors = buffer(wanted.colors, self.shape.channels * n);
         let mut viewmats = buffer(wanted.viewmats, 12);
         let mut backgrounds = buffer(wanted.backgrounds, self.shape.channels);
+        let mut means2d = buffer(wanted.means2d, 2 * n);
         let geometry = (
             split(&mut means, views),
             split(&mut quats, views),
@@ -422,12 +428,13 @@ impl<'a, T: Real> Batch<'a, T> {
             split(&mut colors, views),
             split(&mut viewmats, views),
             split(&mut backgrounds, views),
+            split(&mut means2d, views),
         );
         let tiles_skipped = (geometry.into_par_iter(), rest.into_par_iter())
             .into_par_iter()
             .enumerate()
             .map(
-                |(view, ((means, quats, scales, opacities), (colors, viewmat, background)))| {
+                |(view, ((means, quats, scales, opacities), (colors, viewmat, background, means2d)))| {
                     let v = Cotangents {
                         colors: &v_colors[view * pixels * total..][..pixels * total],
                         alphas: &v_alphas[view * pixels..][..pixels],
@@ -440,6 +447,8 @@ impl<'a, T: Real> Batch<'a, T> {
                         colors,
                         viewmat,
                         background,
+                        means2d: rows_mut(means2d),
+                        detach_means2d: wanted.detach_means2d,
                     };
                     let state = &state.views[view];
                     render_view_vjp(&self.view(view), self.mode, &self.limits, state, v, out)
@@ -458,6 +467,7 @@ impl<'a, T: Real> Batch<'a, T> {
                 Some(slabs) => self.shared(backgrounds, slabs),
                 None => backgrounds,
             },
+            means2d,
             tiles_skipped,
         })
     }

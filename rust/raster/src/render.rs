@@ -170,6 +170,9 @@ pub(crate) struct ViewGradients<'a, T> {
     pub(crate) colors: &'a mut [T],
     pub(crate) viewmat: &'a mut [T],
     pub(crate) background: &'a mut [T],
+    pub(crate) means2d: &'a mut [[T; 2]],
+    /// Leave what passes through `means2d` out of the others.
+    pub(crate) detach_means2d: bool,
 }
 
 fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
@@ -286,6 +289,13 @@ impl<T: Real> Slots<'_, T> {
     }
 }
 
+/// Gradient of a splat's centre in pixels, from its first moments Σ h u and Σ h v.
+#[inline(always)]
+fn centre_vjp<T: Real>(splat: &Splat<T>, [u, v]: [T; 2]) -> [T; 2] {
+    let gain = T::of(2.0 * std::f64::consts::LN_2) * splat.opacity;
+    [gain * splat.w11 * u, gain * (splat.w12 * u + splat.w22 * v)]
+}
+
 /// The vjp of [`render_view`]; returns how many tiles had no incoming gradient. Gradients are added.
 pub(crate) fn render_view_vjp<T: Real>(
     view: &View<'_, T>,
@@ -312,7 +322,7 @@ pub(crate) fn render_view_vjp<T: Real>(
             && out.quats.is_empty()
             && out.scales.is_empty()
             && out.opacities.is_empty());
-    if !geometry && (out.colors.is_empty() || colored == 0) {
+    if !geometry && out.means2d.is_empty() && (out.colors.is_empty() || colored == 0) {
         return gradients.tiles_skipped;
     }
     let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
@@ -325,30 +335,40 @@ pub(crate) fn render_view_vjp<T: Real>(
         pieces(out.scales, CHUNK, count),
         pieces(out.opacities, CHUNK, count),
         pieces(out.colors, CHUNK * stride.max(1), count),
+        pieces(out.means2d, CHUNK, count),
         covers,
     )
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, (means, quats, scales, opacities, colors, cover))| {
-            let mut v = ChunkGradients::new();
-            for local in 0..cover.len() {
-                let own = &positions[cover.pairs_of(local)];
-                if own.is_empty() {
-                    continue;
+        .map(
+            |(chunk, (means, quats, scales, opacities, colors, means2d, cover))| {
+                let mut v = ChunkGradients::new();
+                for local in 0..cover.len() {
+                    let own = &positions[cover.pairs_of(local)];
+                    if own.is_empty() {
+                        continue;
+                    }
+                    let v_colors = if colors.is_empty() {
+                        &mut []
+                    } else {
+                        &mut colors[local * stride..][..colored]
+                    };
+                    let mut sums = slots.sum(own, v_colors);
+                    if let Some(v) = means2d.get_mut(local) {
+                        *v = centre_vjp(&state.binned.splats[chunk * CHUNK + local], [sums[1], sums[2]]);
+                        if out.detach_means2d {
+                            sums[1..3].fill(T::ZERO);
+                        }
+                    }
+                    v.push(local, sums);
                 }
-                let v_colors = if colors.is_empty() {
-                    &mut []
-                } else {
-                    &mut colors[local * stride..][..colored]
-                };
-                v.push(local, slots.sum(own, v_colors));
-            }
-            if geometry && v.len > 0 {
-                levels::vjp(level, &view.gaussians, chunk * CHUNK, &lens, camera, &mut v);
-                v.add_to(means, quats, scales, opacities);
-            }
-            v.viewmat
-        })
+                if geometry && v.len > 0 {
+                    levels::vjp(level, &view.gaussians, chunk * CHUNK, &lens, camera, &mut v);
+                    v.add_to(means, quats, scales, opacities);
+                }
+                v.viewmat
+            },
+        )
         .collect();
     if camera {
         for v in &v_viewmats {
@@ -393,6 +413,8 @@ pub struct GaussianGrads<T> {
     pub viewmat: [[T; 4]; 3],
     /// Of the background.
     pub background: Vec<T>,
+    /// Of the centres on screen, per pixel: what densification strategies watch. Already contained in the others.
+    pub means2d: Vec<[T; 2]>,
 }
 
 /// Renders single views.
@@ -490,6 +512,7 @@ impl<T: Real> Renderer<T> {
             colors: vec![T::ZERO; n * gaussians.channels],
             viewmat: [[T::ZERO; 4]; 3],
             background: vec![T::ZERO; gaussians.channels],
+            means2d: vec![[T::ZERO; 2]; n],
         };
         let out = ViewGradients {
             means: &mut grads.means,
@@ -499,6 +522,8 @@ impl<T: Real> Renderer<T> {
             colors: &mut grads.colors,
             viewmat: grads.viewmat.as_flattened_mut(),
             background: &mut grads.background,
+            means2d: &mut grads.means2d,
+            detach_means2d: false,
         };
         let v = Cotangents {
             colors: v_colors,

@@ -2,7 +2,7 @@
 
 mod support;
 
-use bigs_raster::{Camera, CameraModel, GaussianGrads, RasterSettings, RenderMode, Renderer};
+use bigs_raster::{Camera, CameraModel, GaussianGrads, Intrinsics, RasterSettings, RenderMode, Renderer};
 use support::{Random, Scene, VIEWMAT, camera, naive, naive_with, relative};
 
 #[test]
@@ -221,5 +221,52 @@ fn every_cpu_level_passes() {
             "{level}: {}",
             String::from_utf8_lossy(&run.stdout)
         );
+    }
+}
+
+#[test]
+fn gradients_on_screen_are_those_of_moving_the_image() {
+    // Moving the principal point moves every centre and changes nothing else while no slope is limited.
+    let (width, height) = (24, 20);
+    let settings = RasterSettings {
+        alpha_threshold: 0.0,
+        min_transmittance: 0.0,
+        ..Default::default()
+    };
+    let mut scene = Scene::<f64>::random(1, 3, 31);
+    scene.means[0] = [0.05, -0.1, 1.2];
+    let renderer = Renderer::<f64>::new(&settings, RenderMode::Rgb).unwrap();
+    let mut r = Random::new(4);
+    let v_colors: Vec<f64> = (0..width * height * 3).map(|_| r.uniform(-1.0, 1.0)).collect();
+    let v_alphas = vec![0.0; width * height];
+    let shifted = |shift: [f64; 2]| {
+        let [fx, fy, cx, cy] = support::intrinsics(width, height);
+        let k = Intrinsics {
+            fx,
+            fy,
+            cx: cx + shift[0],
+            cy: cy + shift[1],
+        };
+        Camera::new(VIEWMAT, k, width, height).unwrap()
+    };
+    let loss = |shift| {
+        let frame = renderer.render(&scene.view(), &shifted(shift), None).unwrap();
+        frame
+            .colors
+            .iter()
+            .zip(&v_colors)
+            .map(|(a, b)| a * b)
+            .sum::<f64>()
+    };
+    let camera = shifted([0.0; 2]);
+    let frame = renderer.render(&scene.view(), &camera, None).unwrap();
+    let grads = renderer
+        .render_vjp(&scene.view(), &camera, None, &frame, &v_colors, &v_alphas)
+        .unwrap();
+    let h = 1e-5;
+    for (axis, step) in [(0, [h, 0.0]), (1, [0.0, h])] {
+        let expected = (loss(step) - loss(step.map(|s: f64| -s))) / (2.0 * h);
+        assert!((grads.means2d[0][axis] - expected).abs() < 1e-6 * (1.0 + expected.abs()));
+        assert!(expected.abs() > 1e-3);
     }
 }
