@@ -70,7 +70,7 @@ def rasterization(
         render_mode: the colours (RGB), accumulated camera z (D), that divided by alpha (ED), or both kinds.
         camera_model: "pinhole", or "ortho": parallel rays, x = fx X + cx with fx in pixels per metre. Depth
             is camera z in both, and so are the near and the far plane.
-        means2d: what `info["means2d"]` is: mere "values", or a part of the graph that has a `.grad` (per pixel)
+        means2d: what `info["means2d"]` is: mere "values", or a part of the graph with a `.grad` (per pixel)
             after `retain_grad()`, as densification needs: "full", or "packed" [nnz, 2] without those that no
             pixel sees. Backend "torch" has values only.
         backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -130,8 +130,10 @@ def rasterize(
     }
     between = None
     if means2d != "values":
+        # Only backgrounds and the mask may be absent.
+        means, viewmats, Ks = (cast(torch.Tensor, inputs[i]) for i in (0, 5, 6))
         seen = depths > 0
-        packed = screen.centres(centres, seen, inputs[0], inputs[5], inputs[6], call.camera_model)
+        packed = screen.centres(centres, seen, means, viewmats, Ks, call.camera_model)
         between = screen.everywhere(packed, seen)
         info["means2d"] = packed if means2d == "packed" else between
     images = _Rasterize.apply((colors, alphas), state, arrays, call, info, between, *inputs)
