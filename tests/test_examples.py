@@ -36,7 +36,7 @@ def pixels(path: Path) -> np.ndarray:
 
 def test_every_example_has_a_test_a_purpose_and_a_main() -> None:
     names = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert names == {"render_gaussians", "fit_image", "pose_hand", "reconstruct_arctic"}
+    assert names == {"render_gaussians", "fit_image", "pose_hand", "reconstruct_arctic", "gsplat_script"}
     for name in names:
         tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
         assert "Key ideas:" in (ast.get_docstring(tree) or "")
@@ -62,6 +62,15 @@ def test_fit_image(tmp_path: Path) -> None:
     assert after > before + 8.0
     target, start, end = np.split(pixels(tmp_path / "fit.png"), 3, axis=1)
     assert np.abs(end - target).mean() < 0.3 * np.abs(start - target).mean()
+
+
+def test_gsplat_script(tmp_path: Path) -> None:
+    before, after, count = load("gsplat_script").main(tmp_path, count=150, steps=100, size=32, views=4)
+    assert after > before + 5.0
+    # A fifth of the Gaussians, those with the largest gradients on screen, were split in two.
+    assert count == 180
+    views, fit = np.split(pixels(tmp_path / "views.png"), 2, axis=0)
+    assert np.abs(fit - views).mean() < 0.1
 
 
 def test_pose_hand(tmp_path: Path) -> None:
