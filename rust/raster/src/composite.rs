@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::dispatch::{self, SimdLevel};
 use crate::kernel::{
-    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_PIXELS, MOMENTS, TileCotangents, TileImage,
-    TilePlane, TileTask,
+    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TileImage, TilePlane,
+    TileTask,
 };
 use crate::project::Splat;
 use crate::real::Real;
@@ -16,16 +16,19 @@ use crate::tiles::{TileBins, TileGrid};
 
 /// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
 const LEAST_ALPHA: f64 = 1e-10;
+/// Most pixels along a side of a tile.
+const MAX_SIDE: usize = 16;
 
-/// What the backward pass needs of the composited tiles. Tile-major; pixels of a tile in block order.
+/// What the backward pass needs of the composited tiles. Tile-major, a block of pixels in each `Lanes`.
 #[derive(Debug)]
 pub(crate) struct Canvas<T> {
-    transmittance: Vec<T>,
-    last: Vec<u32>,
+    transmittance: Vec<Lanes<T>>,
+    /// See [`TileImage`].
+    end: Vec<Lanes<T>>,
     /// Blocks reached, per entry of `TileBins::ranks`.
     masks: Vec<u16>,
     /// Accumulated depth where the image has expected depth, else empty.
-    depths: Vec<T>,
+    depths: Vec<Lanes<T>>,
 }
 
 /// What all tiles of a view share.
@@ -56,22 +59,41 @@ impl<'a, T: Real> Scene<'a, T> {
         }
     }
 
-    /// Calls `f` with (index in the tile, index in the image) of every pixel of a tile that is to be rendered.
-    fn for_pixels(&self, tile: usize, mut f: impl FnMut(usize, usize)) {
+    fn blocks(&self) -> usize {
+        self.grid.pixels_per_tile() / LANES
+    }
+
+    /// Calls `f` with (block in the tile, first lane, index in the image, pixels) for each row of each of a tile's
+    /// blocks, as far as it lies in the image.
+    #[inline(always)]
+    fn for_block_rows(&self, tile: usize, mut f: impl FnMut(usize, usize, usize, usize)) {
         let (left, top) = self.grid.origin(tile);
-        let (width, height) = (self.grid.width, self.grid.height);
         let side = self.grid.tile_size / BLOCK;
-        for p in 0..self.grid.pixels_per_tile() {
-            let (block, lane) = (p / LANES, p % LANES);
-            let x = left + block % side * BLOCK + lane % BLOCK;
-            let y = top + block / side * BLOCK + lane / BLOCK;
-            if x < width && y < height {
-                let pixel = y * width + x;
-                if self.pixel_mask.is_none_or(|mask| mask[pixel]) {
-                    f(p, pixel);
+        for y in 0..self.grid.tile_size.min(self.grid.height - top) {
+            for column in 0..side {
+                let x = left + column * BLOCK;
+                if x < self.grid.width {
+                    f(
+                        y / BLOCK * side + column,
+                        y % BLOCK * BLOCK,
+                        (top + y) * self.grid.width + x,
+                        BLOCK.min(self.grid.width - x),
+                    );
                 }
             }
         }
+    }
+
+    /// The pixels of each block that are to be rendered.
+    fn open_pixels(&self, tile: usize) -> [u16; MAX_BLOCKS] {
+        let mut open = [0u16; MAX_BLOCKS];
+        self.for_block_rows(tile, |block, lane, pixel, count| {
+            for i in 0..count {
+                let wanted = self.pixel_mask.is_none_or(|mask| mask[pixel + i]);
+                open[block] |= u16::from(wanted) << (lane + i);
+            }
+        });
+        open
     }
 
     /// The background of a channel; depth has none.
@@ -83,148 +105,169 @@ impl<'a, T: Real> Scene<'a, T> {
     }
 }
 
-/// Cuts a buffer into one piece per group of `tiles` tiles, `stride` values per entry of the tiles' lists.
-fn pieces_by_tile<'a, U>(
-    mut buffer: &'a mut [U],
-    offsets: &[u32],
+/// Consecutive tiles of one row of tiles: their rows of the image, and their part of the canvas.
+struct Strip<'a, T> {
+    tile: usize,
     tiles: usize,
-    stride: usize,
-) -> Vec<&'a mut [U]> {
-    let ends = offsets.iter().skip(tiles).step_by(tiles);
-    let starts = offsets.iter().step_by(tiles);
-    starts
-        .zip(ends)
-        .map(|(start, end)| {
-            let size = (end - start) as usize * stride;
-            let (piece, rest) = std::mem::take(&mut buffer).split_at_mut(size);
-            buffer = rest;
-            piece
-        })
-        .collect()
+    colors: [&'a mut [T]; MAX_SIDE],
+    alphas: [&'a mut [T]; MAX_SIDE],
+    transmittance: &'a mut [Lanes<T>],
+    end: &'a mut [Lanes<T>],
+    depths: &'a mut [Lanes<T>],
+    masks: &'a mut [u16],
 }
 
-/// One row of tiles: its part of the image, which is contiguous, and of the canvas.
-struct TileRow<'a, T> {
-    colors: &'a mut [T],
-    alphas: &'a mut [T],
-    transmittance: &'a mut [T],
-    last: &'a mut [u32],
-    depths: &'a mut [T],
-    masks: &'a mut [u16],
+/// Takes the first values off, or all there are: what nobody asked for is empty.
+fn cut<'a, U>(slice: &mut &'a mut [U], at: usize) -> &'a mut [U] {
+    let at = at.min(slice.len());
+    let (head, tail) = std::mem::take(slice).split_at_mut(at);
+    *slice = tail;
+    head
+}
+
+impl<'a, T: Real> Strip<'a, T> {
+    /// Takes the first `tiles` tiles off.
+    fn take(&mut self, scene: &Scene<'_, T>, tiles: usize) -> Self {
+        let (blocks, offsets) = (scene.blocks(), &scene.bins.offsets);
+        let pixels = tiles * scene.grid.tile_size;
+        let total = scene.channels.total;
+        let entries = offsets[self.tile + tiles] - offsets[self.tile];
+        let head = Self {
+            tile: self.tile,
+            tiles,
+            colors: std::array::from_fn(|y| cut(&mut self.colors[y], pixels * total)),
+            alphas: std::array::from_fn(|y| cut(&mut self.alphas[y], pixels)),
+            transmittance: cut(&mut self.transmittance, tiles * blocks),
+            end: cut(&mut self.end, tiles * blocks),
+            depths: cut(&mut self.depths, tiles * blocks),
+            masks: cut(&mut self.masks, entries as usize),
+        };
+        self.tile += tiles;
+        self.tiles -= tiles;
+        head
+    }
+
+    fn halves(mut self, scene: &Scene<'_, T>) -> (Self, Option<Self>) {
+        if self.tiles < 2 {
+            return (self, None);
+        }
+        let head = self.take(scene, self.tiles / 2);
+        (head, Some(self))
+    }
 }
 
 /// Composites every tile over the background into the image.
 pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>, colors: &mut [T], alphas: &mut [T]) -> Canvas<T> {
     let grid = &scene.grid;
-    let pixels = grid.pixels_per_tile();
+    let blocks = grid.len() * scene.blocks();
     let total = scene.channels.total;
     let mut canvas = Canvas {
-        transmittance: vec![T::ONE; grid.len() * pixels],
-        last: vec![0; grid.len() * pixels],
+        transmittance: vec![Lanes::ZERO; blocks],
+        end: vec![Lanes::ZERO; blocks],
         masks: vec![0; scene.bins.ranks.len()],
-        depths: vec![
-            T::ZERO;
-            if scene.expected_depth {
-                grid.len() * pixels
-            } else {
-                0
-            }
-        ],
+        depths: vec![Lanes::ZERO; if scene.expected_depth { blocks } else { 0 }],
     };
-    let image_row = grid.tile_size * grid.width;
-    let canvas_row = grid.columns * pixels;
-    let mut depths = canvas.depths.chunks_mut(canvas_row);
-    let rows: Vec<TileRow<'_, T>> = pieces_by_tile(&mut canvas.masks, &scene.bins.offsets, grid.columns, 1)
-        .into_iter()
-        .zip(colors.chunks_mut(image_row * total))
-        .zip(alphas.chunks_mut(image_row))
-        .zip(canvas.transmittance.chunks_mut(canvas_row))
-        .zip(canvas.last.chunks_mut(canvas_row))
-        .map(|((((masks, colors), alphas), transmittance), last)| TileRow {
-            colors,
-            alphas,
-            transmittance,
-            last,
-            depths: depths.next().unwrap_or_default(),
-            masks,
+    let mut rest = Strip {
+        tile: 0,
+        tiles: grid.len(),
+        colors: Default::default(),
+        alphas: Default::default(),
+        transmittance: &mut canvas.transmittance,
+        end: &mut canvas.end,
+        depths: &mut canvas.depths,
+        masks: &mut canvas.masks,
+    };
+    let strips: Vec<Strip<'_, T>> = colors
+        .chunks_mut(grid.tile_size * grid.width * total)
+        .zip(alphas.chunks_mut(grid.tile_size * grid.width))
+        .map(|(colors, alphas)| {
+            let mut strip = rest.take(scene, grid.columns);
+            for (row, colors) in strip.colors.iter_mut().zip(colors.chunks_mut(grid.width * total)) {
+                *row = colors;
+            }
+            for (row, alphas) in strip.alphas.iter_mut().zip(alphas.chunks_mut(grid.width)) {
+                *row = alphas;
+            }
+            strip
         })
         .collect();
-    rows.into_par_iter()
-        .enumerate()
-        .for_each(|(row, out)| composite_row(scene, row, out));
+    let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
+    let planes = || vec![Lanes::ZERO; total * scene.blocks()];
+    strips
+        .into_par_iter()
+        .flat_map(|strip| rayon::iter::split(strip, |strip| strip.halves(scene)))
+        .for_each_init(planes, |planes, mut strip| {
+            while strip.tiles > 0 {
+                let tile = strip.take(scene, 1);
+                composite_tile(scene, &background, planes, tile);
+            }
+        });
     canvas
 }
 
-fn composite_row<T: Real>(scene: &Scene<'_, T>, row: usize, out: TileRow<'_, T>) {
+fn composite_tile<T: Real>(
+    scene: &Scene<'_, T>,
+    background: &[T],
+    planes: &mut [Lanes<T>],
+    mut out: Strip<'_, T>,
+) {
     let level = SimdLevel::detect();
-    let grid = &scene.grid;
-    let pixels = grid.pixels_per_tile();
+    let blocks = scene.blocks();
     let total = scene.channels.total;
-    let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
-    let mut planes = vec![T::ZERO; total * pixels];
-    let first_entry = scene.bins.offsets[row * grid.columns] as usize;
-    for column in 0..grid.columns {
-        let tile = row * grid.columns + column;
-        let mut task = scene.task(tile);
-        let own = column * pixels..(column + 1) * pixels;
-        let transmittance = &mut out.transmittance[own.clone()];
-        if task.ranks.is_empty() {
-            planes.fill(T::ZERO);
-        } else {
-            let mut open = [false; MAX_PIXELS];
-            scene.for_pixels(tile, |p, _| open[p] = true);
-            let entries = scene.bins.offsets[tile] as usize - first_entry;
-            while task.first < total {
-                let tile_image = TileImage {
-                    colors: &mut planes[task.first * pixels..],
-                    transmittance: &mut *transmittance,
-                    last: &mut out.last[own.clone()],
-                    masks: &mut out.masks[entries..][..task.ranks.len()],
-                };
-                dispatch::forward(level, &task, &open, tile_image);
-                task.first += MAX_CHANNELS;
-            }
+    let mut task = scene.task(out.tile);
+    if task.ranks.is_empty() {
+        planes.fill(Lanes::ZERO);
+        out.transmittance.fill(Lanes::ONE);
+        out.end.fill(Lanes::ZERO);
+    } else {
+        let open = scene.open_pixels(out.tile);
+        while task.first < total {
+            let tile_image = TileImage {
+                colors: &mut planes[task.first * blocks..],
+                transmittance: &mut *out.transmittance,
+                end: &mut *out.end,
+                masks: &mut *out.masks,
+            };
+            dispatch::forward(level, &task, &open, tile_image);
+            task.first += MAX_CHANNELS;
         }
-        if scene.expected_depth {
-            out.depths[own].copy_from_slice(&planes[(total - 1) * pixels..]);
-        }
-        write_tile(
-            scene,
-            &background,
-            column,
-            &planes,
-            transmittance,
-            out.colors,
-            out.alphas,
-        );
+    }
+    if scene.expected_depth {
+        out.depths.copy_from_slice(&planes[(total - 1) * blocks..]);
+    }
+    match total {
+        1 => write_tile::<T, 1>(scene, background, planes, &mut out),
+        3 => write_tile::<T, 3>(scene, background, planes, &mut out),
+        4 => write_tile::<T, 4>(scene, background, planes, &mut out),
+        _ => write_tile::<T, 0>(scene, background, planes, &mut out),
     }
 }
 
-/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.
-fn write_tile<T: Real>(
+/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha. K is the number of
+/// channels if it is known.
+fn write_tile<T: Real, const K: usize>(
     scene: &Scene<'_, T>,
     background: &[T],
-    column: usize,
-    planes: &[T],
-    transmittance: &[T],
-    colors: &mut [T],
-    alphas: &mut [T],
+    planes: &[Lanes<T>],
+    out: &mut Strip<'_, T>,
 ) {
-    let grid = &scene.grid;
-    let total = scene.channels.total;
-    let (pixels, side) = (grid.pixels_per_tile(), grid.tile_size / BLOCK);
-    let left = column * grid.tile_size;
-    for y in 0..alphas.len() / grid.width {
-        for x in (0..grid.tile_size.min(grid.width - left)).step_by(BLOCK) {
-            let p = (y / BLOCK * side + x / BLOCK) * LANES + y % BLOCK * BLOCK;
-            for i in 0..BLOCK.min(grid.width - left - x) {
-                let pixel = y * grid.width + left + x + i;
-                let values = &mut colors[pixel * total..][..total];
-                for (channel, value) in values.iter_mut().enumerate() {
-                    *value = planes[channel * pixels + p + i] + transmittance[p + i] * background[channel];
+    let total = if K > 0 { K } else { scene.channels.total };
+    let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
+    for (y, (colors, alphas)) in out.colors.iter_mut().zip(&mut out.alphas).enumerate() {
+        for (column, (colors, alphas)) in colors
+            .chunks_mut(BLOCK * total)
+            .zip(alphas.chunks_mut(BLOCK))
+            .enumerate()
+        {
+            let block = y / BLOCK * side + column;
+            let lane = y % BLOCK * BLOCK;
+            let transmittance = &out.transmittance[block].0[lane..lane + BLOCK];
+            for (i, (values, alpha)) in colors.chunks_exact_mut(total).zip(alphas).enumerate() {
+                for channel in 0..total {
+                    values[channel] =
+                        planes[channel * blocks + block].0[lane + i] + transmittance[i] * background[channel];
                 }
-                let alpha = T::ONE - transmittance[p + i];
-                alphas[pixel] = alpha;
+                *alpha = T::ONE - transmittance[i];
                 if scene.expected_depth {
                     values[total - 1] = values[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
                 }
@@ -250,6 +293,14 @@ pub(crate) struct CompositeGradients<T> {
     pub(crate) tiles_skipped: usize,
 }
 
+/// Cuts a buffer into one piece per tile, `stride` values per entry of the tile's list.
+fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], stride: usize) -> Vec<&'a mut [U]> {
+    offsets
+        .windows(2)
+        .map(|pair| cut(&mut buffer, (pair[1] - pair[0]) as usize * stride))
+        .collect()
+}
+
 /// The vjp of [`composite`].
 pub(crate) fn composite_vjp<T: Real>(
     scene: &Scene<'_, T>,
@@ -257,44 +308,42 @@ pub(crate) fn composite_vjp<T: Real>(
     v: Cotangents<'_, T>,
 ) -> CompositeGradients<T> {
     let level = SimdLevel::detect();
-    let pixels = scene.grid.pixels_per_tile();
+    let blocks = scene.blocks();
     let total = scene.channels.total;
     let stride = MOMENTS + total;
     let mut slots = vec![T::ZERO; scene.bins.ranks.len() * stride];
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     (
-        pieces_by_tile(&mut slots, &scene.bins.offsets, 1, stride),
+        pieces_by_tile(&mut slots, &scene.bins.offsets, stride),
         backgrounds.par_chunks_mut(total),
     )
         .into_par_iter()
         .enumerate()
-        .for_each(|(tile, (slots, v_background))| {
+        .for_each_init(TileGradients::new, |incoming, (tile, (slots, v_background))| {
             let mut task = scene.task(tile);
             if task.ranks.is_empty() && scene.background.is_none() {
                 return;
             }
-            let own = tile * pixels..(tile + 1) * pixels;
+            let own = tile * blocks..(tile + 1) * blocks;
             let transmittance = &canvas.transmittance[own.clone()];
             let mut skipped = true;
             while task.first < total {
-                let (v_values, v_transmittance, any) = load_cotangents(scene, canvas, tile, task.first, v);
-                for k in 0..(total - task.first).min(MAX_CHANNELS) {
-                    v_background[task.first + k] = transmittance
-                        .iter()
-                        .zip(v_values[k].iter().flat_map(|lanes| &lanes.0))
-                        .map(|(&t, &v)| t * v)
-                        .sum();
+                let any = incoming.load(scene, canvas, tile, task.first, v);
+                if scene.background.is_some() {
+                    for k in 0..(total - task.first).min(MAX_CHANNELS) {
+                        v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
+                    }
                 }
                 if any && !task.ranks.is_empty() {
                     skipped = false;
                     let cotangents = TileCotangents {
                         transmittance,
-                        last: &canvas.last[own.clone()],
+                        end: &canvas.end[own.clone()],
                         masks: &canvas.masks
                             [scene.bins.offsets[tile] as usize..scene.bins.offsets[tile + 1] as usize],
-                        v_values: &v_values,
-                        v_transmittance: &v_transmittance,
+                        v_values: &incoming.v_values,
+                        v_transmittance: &incoming.v_transmittance,
                     };
                     dispatch::backward(level, &task, &cotangents, slots, stride);
                 }
@@ -317,41 +366,109 @@ pub(crate) fn composite_vjp<T: Real>(
     }
 }
 
-/// Gradients of the channels from `first` on and of the transmittance for one tile, and whether any is not zero.
-fn load_cotangents<T: Real>(
-    scene: &Scene<'_, T>,
-    canvas: &Canvas<T>,
-    tile: usize,
-    first: usize,
-    v: Cotangents<'_, T>,
-) -> ([TilePlane<T>; MAX_CHANNELS], TilePlane<T>, bool) {
-    let total = scene.channels.total;
-    let pixels = scene.grid.pixels_per_tile();
-    let used = (total - first).min(MAX_CHANNELS);
-    let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
-    let zero = [Lanes::splat(T::ZERO); MAX_BLOCKS];
-    let (mut v_values, mut v_transmittance) = ([zero; MAX_CHANNELS], zero);
-    let mut any = false;
-    scene.for_pixels(tile, |p, pixel| {
-        // Alpha is 1 − transmittance; it belongs to the first group of channels.
-        let mut v_alpha = if first == 0 { v.alphas[pixel] } else { T::ZERO };
-        let incoming = &v.colors[pixel * total + first..][..used];
-        for k in 0..used {
-            let mut value = incoming[k];
-            if scene.expected_depth && first + k == total - 1 {
-                let alpha = T::ONE - canvas.transmittance[tile * pixels + p];
-                let least = T::of(LEAST_ALPHA);
-                value = value / alpha.greater(least);
-                if alpha > least {
-                    v_alpha += -(value * (canvas.depths[tile * pixels + p] / alpha));
-                }
-            }
-            v_values[k][p / LANES][p % LANES] = value;
-            v_transmittance[p / LANES][p % LANES] += value * background[k];
-            any |= value != T::ZERO;
+fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
+    let products = a
+        .iter()
+        .zip(b)
+        .flat_map(|(a, b)| a.0.iter().zip(&b.0).map(|(&a, &b)| a * b));
+    products.sum()
+}
+
+/// The incoming gradients of one tile, for one group of channels.
+struct TileGradients<T> {
+    v_values: [TilePlane<T>; MAX_CHANNELS],
+    v_transmittance: TilePlane<T>,
+}
+
+impl<T: Real> TileGradients<T> {
+    fn new() -> Self {
+        Self {
+            v_values: [[Lanes::ZERO; MAX_BLOCKS]; MAX_CHANNELS],
+            v_transmittance: [Lanes::ZERO; MAX_BLOCKS],
         }
-        v_transmittance[p / LANES][p % LANES] += -v_alpha;
-        any |= v_alpha != T::ZERO;
-    });
-    (v_values, v_transmittance, any)
+    }
+
+    /// Reads the channels from `first` on; whether any gradient is not zero.
+    fn load(
+        &mut self,
+        scene: &Scene<'_, T>,
+        canvas: &Canvas<T>,
+        tile: usize,
+        first: usize,
+        v: Cotangents<'_, T>,
+    ) -> bool {
+        let total = scene.channels.total;
+        let whole = scene.pixel_mask.is_none()
+            && scene.grid.origin(tile).0 + scene.grid.tile_size <= scene.grid.width
+            && scene.grid.origin(tile).1 + scene.grid.tile_size <= scene.grid.height;
+        if whole && !scene.expected_depth && scene.background.is_none() && first == 0 {
+            match total {
+                1 => return self.load_whole::<1>(scene, tile, v),
+                3 => return self.load_whole::<3>(scene, tile, v),
+                4 => return self.load_whole::<4>(scene, tile, v),
+                _ => {}
+            }
+        }
+        let used = (total - first).min(MAX_CHANNELS);
+        let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
+        *self = Self::new();
+        let mut any = false;
+        let least = T::of(LEAST_ALPHA);
+        scene.for_block_rows(tile, |block, lane, pixel, count| {
+            for i in 0..count {
+                let (pixel, lane) = (pixel + i, lane + i);
+                if !scene.pixel_mask.is_none_or(|mask| mask[pixel]) {
+                    continue;
+                }
+                // Alpha is 1 − transmittance; it belongs to the first group of channels.
+                let mut v_alpha = if first == 0 { v.alphas[pixel] } else { T::ZERO };
+                let mut v_transmittance = T::ZERO;
+                let incoming = &v.colors[pixel * total + first..][..used];
+                for k in 0..used {
+                    let mut value = incoming[k];
+                    if scene.expected_depth && first + k == total - 1 {
+                        let place = tile * scene.blocks() + block;
+                        let alpha = T::ONE - canvas.transmittance[place].0[lane];
+                        value = value / alpha.greater(least);
+                        if alpha > least {
+                            v_alpha += -(value * (canvas.depths[place].0[lane] / alpha));
+                        }
+                    }
+                    self.v_values[k][block].0[lane] = value;
+                    v_transmittance += value * background[k];
+                    any |= value != T::ZERO;
+                }
+                any |= v_alpha != T::ZERO;
+                self.v_transmittance[block].0[lane] = v_transmittance + -v_alpha;
+            }
+        });
+        any
+    }
+
+    /// A tile within the image, all of whose K channels are colours over black or plain depth.
+    fn load_whole<const K: usize>(
+        &mut self,
+        scene: &Scene<'_, T>,
+        tile: usize,
+        v: Cotangents<'_, T>,
+    ) -> bool {
+        let mut any = false;
+        scene.for_block_rows(tile, |block, lane, pixel, _| {
+            let colors = &v.colors[pixel * K..(pixel + BLOCK) * K];
+            let alphas = &v.alphas[pixel..pixel + BLOCK];
+            for i in 0..BLOCK {
+                for k in 0..K {
+                    self.v_values[k][block].0[lane + i] = colors[i * K + k];
+                }
+                self.v_transmittance[block].0[lane + i] = -alphas[i];
+            }
+            for &value in colors {
+                any |= value != T::ZERO;
+            }
+            for &value in alphas {
+                any |= value != T::ZERO;
+            }
+        });
+        any
+    }
 }

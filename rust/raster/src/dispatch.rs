@@ -5,16 +5,16 @@
 use std::sync::OnceLock;
 
 use crate::kernel::{
-    MAX_CHANNELS, MAX_PIXELS, TileCotangents, TileImage, TileTask, backward_tile, forward_tile,
+    MAX_BLOCKS, MAX_CHANNELS, TileCotangents, TileImage, TileTask, backward_tile, forward_tile,
 };
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
-use crate::real::Fused;
-use crate::real::{Real, Separate};
+use crate::real::Real;
+#[cfg(target_arch = "x86_64")]
+use crate::vector::Vectors;
 
 /// CPU features that the kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SimdLevel {
-    /// What the target guarantees; no fused multiply-add.
+    /// What the target guarantees; on x86-64 that is SSE2, without fused multiply-add.
     Baseline,
     /// ARM's 128-bit vectors.
     #[cfg(target_arch = "aarch64")]
@@ -84,7 +84,7 @@ impl SimdLevel {
 }
 
 macro_rules! compiled_for {
-    ($module:ident, $features:literal) => {
+    ($module:ident, $Vector:ident, $features:literal) => {
         #[cfg(target_arch = "x86_64")]
         mod $module {
             use super::*;
@@ -92,10 +92,10 @@ macro_rules! compiled_for {
             #[target_feature(enable = $features)]
             pub(super) fn forward<T: Real, const K: usize>(
                 task: &TileTask<'_, T>,
-                open: &[bool; MAX_PIXELS],
+                open: &[u16; MAX_BLOCKS],
                 out: TileImage<'_, T>,
             ) {
-                forward_tile::<T, Fused, K>(task, open, out);
+                forward_tile::<<T as Vectors>::$Vector, K>(task, open, out);
             }
 
             #[target_feature(enable = $features)]
@@ -105,14 +105,15 @@ macro_rules! compiled_for {
                 slots: &mut [T],
                 stride: usize,
             ) {
-                backward_tile::<T, Fused, K>(task, pixels, slots, stride);
+                backward_tile::<<T as Vectors>::$Vector, K>(task, pixels, slots, stride);
             }
         }
     };
 }
-compiled_for!(avx2, "avx2,fma,bmi1,bmi2,popcnt,lzcnt");
+compiled_for!(avx2, Avx2, "avx2,fma,bmi1,bmi2,popcnt,lzcnt");
 compiled_for!(
     avx512,
+    Avx512,
     "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma,bmi1,bmi2,popcnt,lzcnt"
 );
 
@@ -120,13 +121,13 @@ compiled_for!(
 fn forward_level<T: Real, const K: usize>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
-    open: &[bool; MAX_PIXELS],
+    open: &[u16; MAX_BLOCKS],
     out: TileImage<'_, T>,
 ) {
     match level {
-        SimdLevel::Baseline => forward_tile::<T, Separate, K>(task, open, out),
+        SimdLevel::Baseline => forward_tile::<T::Baseline, K>(task, open, out),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => forward_tile::<T, Fused, K>(task, open, out),
+        SimdLevel::Neon => forward_tile::<T::Baseline, K>(task, open, out),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
         SimdLevel::Avx2 => unsafe { avx2::forward::<T, K>(task, open, out) },
@@ -145,9 +146,9 @@ fn backward_level<T: Real, const K: usize>(
     stride: usize,
 ) {
     match level {
-        SimdLevel::Baseline => backward_tile::<T, Separate, K>(task, pixels, slots, stride),
+        SimdLevel::Baseline => backward_tile::<T::Baseline, K>(task, pixels, slots, stride),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => backward_tile::<T, Fused, K>(task, pixels, slots, stride),
+        SimdLevel::Neon => backward_tile::<T::Baseline, K>(task, pixels, slots, stride),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
         SimdLevel::Avx2 => unsafe { avx2::backward::<T, K>(task, pixels, slots, stride) },
@@ -161,7 +162,7 @@ fn backward_level<T: Real, const K: usize>(
 pub(crate) fn forward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
-    open: &[bool; MAX_PIXELS],
+    open: &[u16; MAX_BLOCKS],
     out: TileImage<'_, T>,
 ) {
     match task.channels.total - task.first {
@@ -173,7 +174,7 @@ pub(crate) fn forward<T: Real>(
     }
 }
 
-/// The vjp of [`forward`], added to `slots`.
+/// The vjp of [`forward`], written to `slots`.
 pub(crate) fn backward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,

@@ -100,6 +100,7 @@ mod sh;
 mod sort;
 pub mod stages;
 mod tiles;
+mod vector;
 
 pub use batch::{
     Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs, Wanted,
@@ -108,7 +109,7 @@ pub use camera::{Camera, CameraModel, Intrinsics};
 pub use error::RasterError;
 pub use gaussians::Gaussians;
 pub use pool::release_memory;
-pub use real::{Arithmetic, Real};
+pub use real::Real;
 pub use render::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};
 pub use sh::{Harmonics, HarmonicsGradients};

@@ -1,11 +1,11 @@
 //! The scalar the whole pipeline is generic over: `f32` for work, `f64` for truth.
 
 use std::fmt::{Debug, Display};
-use std::hint::select_unpredictable;
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub};
 
 use crate::sort::RadixKey;
+use crate::vector::Vectors;
 
 /// `f32` or `f64`.
 pub trait Real:
@@ -23,6 +23,7 @@ pub trait Real:
     + Div<Output = Self>
     + Neg<Output = Self>
     + AddAssign
+    + Vectors
     + 'static
 {
     /// The integer of the same width, ordered as the scalar is.
@@ -55,11 +56,10 @@ pub trait Real:
     fn mul_add(self, a: Self, b: Self) -> Self;
     /// An integer that sorts as this number does.
     fn key(self) -> Self::Key;
-    /// 2^x for x ≤ 0 without branches; 0 below the range of normal numbers.
-    fn exp2_of_nonpositive<A: Arithmetic>(self) -> Self;
-
-    /// 1/x for x in (0, 1], to the last bit or two.
-    fn reciprocal<A: Arithmetic>(self) -> Self;
+    /// A number that compares with others of its kind as the places do; above 0. Exact for a milliard places.
+    fn ordinal(place: u32) -> Self;
+    /// One more than the place that [`Real::ordinal`] made this number of, 0 for 0.
+    fn past_ordinal(self) -> u32;
 
     /// The lesser; `other` if either is NaN. One instruction, unlike `f32::min`.
     #[inline(always)]
@@ -78,64 +78,8 @@ pub trait Real:
     }
 }
 
-/// How a·b + c is computed, chosen once per kernel: `mul_add` on a CPU without the instruction is a library call.
-pub trait Arithmetic: 'static {
-    /// Whether a·b + c is one instruction.
-    const FUSED: bool;
-    /// a·b + c
-    fn mul_add<T: Real>(a: T, b: T, c: T) -> T;
-}
-
-/// One rounding.
-pub(crate) struct Fused;
-/// Two roundings, two instructions.
-pub(crate) struct Separate;
-
-impl Arithmetic for Fused {
-    const FUSED: bool = true;
-    #[inline(always)]
-    fn mul_add<T: Real>(a: T, b: T, c: T) -> T {
-        a.mul_add(b, c)
-    }
-}
-
-impl Arithmetic for Separate {
-    const FUSED: bool = false;
-    #[inline(always)]
-    fn mul_add<T: Real>(a: T, b: T, c: T) -> T {
-        a * b + c
-    }
-}
-
-/// 2^f on [-½, ½], f32: degree 5, minimax with c₀ = 1, relative error 9e-8. Fitted: c₁ is not ln 2.
-#[allow(clippy::approx_constant)]
-const EXP2_F32: [f32; 6] = [
-    1.0,
-    0.693_147,
-    0.240_222_42,
-    0.055_507_337,
-    0.009_671_513,
-    0.001_326_472_7,
-];
-/// 2^f on [-½, ½], f64: (ln 2)ᵏ / k! to degree 12, relative error 2e-16.
-const EXP2_F64: [f64; 13] = [
-    1.0,
-    std::f64::consts::LN_2,
-    0.240_226_506_959_100_7,
-    0.055_504_108_664_821_576,
-    0.009_618_129_107_628_477,
-    0.001_333_355_814_642_844_1,
-    0.000_154_035_303_933_816_06,
-    1.525_273_380_405_984e-5,
-    1.321_548_679_014_430_5e-6,
-    1.017_808_600_923_969_7e-7,
-    7.054_911_620_801_121e-9,
-    4.445_538_271_870_81e-10,
-    2.567_843_599_348_82e-11,
-];
-
 macro_rules! real {
-    ($T:ty, $Key:ty, $coefficients:ident, mantissa $mantissa:literal, magic $magic:literal, lowest $lowest:literal, floor $floor:literal, newton $newton:expr) => {
+    ($T:ty, $Key:ty, mantissa $mantissa:literal, terms $terms:literal, floor $floor:literal) => {
         impl Real for $T {
             type Key = $Key;
             const ZERO: Self = 0.0;
@@ -168,7 +112,7 @@ macro_rules! real {
                 let m = <$T>::from_bits(bits.wrapping_sub((exponent << $mantissa).cast_unsigned()));
                 let s = (m - 1.0) / (m + 1.0);
                 let mut sum = 0.0;
-                let mut k = $coefficients.len();
+                let mut k = $terms;
                 while k > 0 {
                     k -= 1;
                     sum = sum * (s * s) + (2.0 * std::f64::consts::LOG2_E / (2 * k + 1) as f64) as $T;
@@ -195,76 +139,24 @@ macro_rules! real {
                 if bits & sign == 0 { bits | sign } else { !bits }
             }
             #[inline(always)]
-            fn reciprocal<A: Arithmetic>(self) -> Self {
-                // A vector of quotients takes as long as a dozen multiply-adds; three Newton steps from a guess off
-                // by 12 % (the exponent negated) take six.
-                let guess: Option<$Key> = $newton;
-                match guess {
-                    Some(guess) if A::FUSED => {
-                        let mut r = <$T>::from_bits(guess.wrapping_sub(self.to_bits()));
-                        for _ in 0..3 {
-                            r = A::mul_add(r, A::mul_add(-self, r, 1.0), r);
-                        }
-                        r
-                    }
-                    _ => 1.0 / self,
-                }
+            fn ordinal(place: u32) -> Self {
+                // Positive floats sort as their bits do, and these start at 1, clear of denormals.
+                <$T>::from_bits((1.0 as $T).to_bits() + place as $Key)
             }
             #[inline(always)]
-            fn exp2_of_nonpositive<A: Arithmetic>(self) -> Self {
-                // Adding 1.5·2^mantissa rounds to an integer and leaves it in the low bits.
-                let clipped = self.greater($lowest);
-                let shifted = clipped + $magic;
-                let fraction = clipped - (shifted - $magic);
-                let mut power = $coefficients[$coefficients.len() - 1];
-                let mut k = $coefficients.len() - 1;
-                while k > 0 {
-                    k -= 1;
-                    power = A::mul_add(power, fraction, $coefficients[k]);
-                }
-                let scaled = <$T>::from_bits(power.to_bits().wrapping_add(shifted.to_bits() << $mantissa));
-                select_unpredictable(self < $lowest, 0.0, scaled)
+            fn past_ordinal(self) -> u32 {
+                (self.to_bits() + 1).saturating_sub((1.0 as $T).to_bits()) as u32
             }
         }
     };
 }
 
-real!(f32, u32, EXP2_F32, mantissa 23, magic 12_582_912.0, lowest -126.0, floor 1e-30, newton Some(0x7EF3_11C3));
-real!(f64, u64, EXP2_F64, mantissa 52, magic 6_755_399_441_055_744.0, lowest -1022.0, floor 1e-290, newton None);
+real!(f32, u32, mantissa 23, terms 6, floor 1e-30);
+real!(f64, u64, mantissa 52, terms 13, floor 1e-290);
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn exp2_matches_the_library() {
-        for i in 0..=40_000 {
-            let x = -f64::from(i) * 0.003;
-            let exact = x.exp2();
-            let double: f64 = x.exp2_of_nonpositive::<Fused>();
-            assert!(
-                (double - exact).abs() <= 6e-16 * exact,
-                "{x}: {double} against {exact}"
-            );
-            let x32 = x as f32;
-            let single: f32 = x32.exp2_of_nonpositive::<Separate>();
-            let exact = f64::from(x32).exp2();
-            assert!((f64::from(single) - exact).abs() <= 3e-7 * exact, "{x}: {single}");
-        }
-        assert_eq!(0f32.exp2_of_nonpositive::<Fused>(), 1.0);
-        assert_eq!((-1e9f32).exp2_of_nonpositive::<Fused>(), 0.0);
-        assert_eq!(f64::NEG_INFINITY.exp2_of_nonpositive::<Fused>(), 0.0);
-    }
-
-    #[test]
-    fn reciprocals_are_exact_to_two_bits() {
-        for i in 1..=10_000 {
-            let x = i as f32 * 1e-4;
-            let error = f64::from(x.reciprocal::<Fused>()) * f64::from(x) - 1.0;
-            assert!(error.abs() < 2.5e-7, "{x}: {error}");
-            assert_eq!(x.reciprocal::<Separate>(), 1.0 / x);
-        }
-    }
 
     #[test]
     fn log2_matches_the_library() {
@@ -290,5 +182,15 @@ mod tests {
     fn keys_sort_as_numbers_do() {
         let sorted = [-1e30f32, -1.0, -1e-40, 0.0, 1e-40, 0.5, 1.0, 3.0e7, f32::MAX];
         assert!(sorted.windows(2).all(|pair| pair[0].key() < pair[1].key()));
+    }
+
+    #[test]
+    fn ordinals_compare_as_places_do() {
+        for place in [0, 1, 2, 1 << 24, (1 << 24) + 1, 1_000_000_000] {
+            assert!(0.0 < f32::ordinal(place) && f32::ordinal(place) < f32::ordinal(place + 1));
+            assert_eq!(f32::ordinal(place).past_ordinal(), place + 1);
+            assert_eq!(f64::ordinal(place).past_ordinal(), place + 1);
+        }
+        assert_eq!(0f32.past_ordinal(), 0);
     }
 }

@@ -1,0 +1,204 @@
+//! The two inner loops: one tile forward, one tile backward.
+//!
+//! A tile is cut into blocks of 4×4 pixels, 16 lanes: one AVX-512 vector, two of AVX2, four of SSE2 or NEON. The loops are
+//! written once, over the trait [`Vector`], and `dispatch` compiles them once per instruction set.
+//!
+//! Forward walks block by block, so that transmittance and colour stay in registers while a block's own list goes by.
+//! Backward walks splat by splat, back to front, so that a splat's gradient is reduced once per tile, and recomputes
+//! alpha: cheaper than storing it.
+
+mod backward;
+mod forward;
+mod reach;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use backward::{TileCotangents, backward_tile};
+pub(crate) use forward::{TileImage, forward_tile};
+
+use crate::project::Splat;
+use crate::real::Real;
+use crate::settings::Limits;
+use crate::vector::Vector;
+
+/// Pixels in a block.
+pub(crate) const LANES: usize = 16;
+/// Pixels along a side of a block.
+pub(crate) const BLOCK: usize = 4;
+/// Most blocks in a tile (tiles of 16×16).
+pub(crate) const MAX_BLOCKS: usize = 16;
+/// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv.
+pub(crate) const MOMENTS: usize = 6;
+/// Most channels composited at once.
+pub(crate) const MAX_CHANNELS: usize = 8;
+/// Splats whose block masks make a word per block.
+const WORD: usize = 64;
+
+/// One value per pixel of a block, where a vector register finds it: a load that straddles two cache lines is slow.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+pub(crate) struct Lanes<T>(pub(crate) [T; LANES]);
+
+impl<T: Real> Lanes<T> {
+    pub(crate) const ZERO: Self = Self([T::ZERO; LANES]);
+    pub(crate) const ONE: Self = Self([T::ONE; LANES]);
+
+    #[inline(always)]
+    fn get<V: Vector<Scalar = T>>(&self, first: usize) -> V {
+        V::load(&self.0[first..first + V::LANES])
+    }
+
+    #[inline(always)]
+    fn set<V: Vector<Scalar = T>>(&mut self, first: usize, values: V) {
+        values.store(&mut self.0[first..first + V::LANES]);
+    }
+}
+
+/// One value per pixel of a tile.
+pub(crate) type TilePlane<T> = [Lanes<T>; MAX_BLOCKS];
+
+/// Where the values of channels come from: the caller's colours, then camera z.
+#[derive(Clone, Copy)]
+pub(crate) struct Channels<'a, T> {
+    pub(crate) colors: &'a [T],
+    /// Values per Gaussian in `colors`.
+    pub(crate) stride: usize,
+    /// Channels composited: `stride`, 1 more for depth after colours, or 1 for depth alone.
+    pub(crate) total: usize,
+    /// Channels of `colors` that are composited: all or none.
+    pub(crate) colored: usize,
+}
+
+/// One tile's work: everything but the outputs.
+#[derive(Clone, Copy)]
+pub(crate) struct TileTask<'a, T> {
+    /// Top-left pixel.
+    pub(crate) origin: (usize, usize),
+    /// Blocks along a side.
+    pub(crate) side: usize,
+    /// Depth ranks of the tile's splats, front to back.
+    pub(crate) ranks: &'a [u32],
+    pub(crate) splats: &'a [Splat<T>],
+    /// Gaussian of each rank.
+    pub(crate) ids: &'a [u32],
+    pub(crate) channels: Channels<'a, T>,
+    /// First of the channels handled now.
+    pub(crate) first: usize,
+    pub(crate) limits: &'a Limits<T>,
+}
+
+impl<T: Real> TileTask<'_, T> {
+    /// Alpha from which a pair counts; a limit of alpha below the threshold lets none count.
+    #[inline(always)]
+    fn threshold(&self) -> T {
+        if self.limits.max_alpha >= self.limits.alpha_threshold {
+            self.limits.alpha_threshold
+        } else {
+            T::of(f64::INFINITY)
+        }
+    }
+}
+
+/// A splat as a tile sees it: (u, v) = (w11 x + w12 y + u0, w22 y + v0) at (x, y) from the tile's corner, and the
+/// values of K channels. One cache line in f32.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Entry<T, const K: usize> {
+    w11: T,
+    w12: T,
+    u0: T,
+    w22: T,
+    v0: T,
+    opacity: T,
+    /// Place in the list as a number that compares as the place does.
+    place: T,
+    values: [T; K],
+}
+
+impl<T: Real, const K: usize> Entry<T, K> {
+    const ZERO: Self = Self {
+        w11: T::ZERO,
+        w12: T::ZERO,
+        u0: T::ZERO,
+        w22: T::ZERO,
+        v0: T::ZERO,
+        opacity: T::ZERO,
+        place: T::ZERO,
+        values: [T::ZERO; K],
+    };
+
+    #[inline(always)]
+    fn load(task: &TileTask<'_, T>, index: usize) -> Self {
+        let rank = task.ranks[index] as usize;
+        let splat = &task.splats[rank];
+        let (x, y) = task.centre(splat);
+        let mut values = [T::ZERO; K];
+        let c = &task.channels;
+        let start = task.ids[rank] as usize * c.stride + task.first;
+        if task.first + K <= c.colored {
+            values.copy_from_slice(&c.colors[start..start + K]);
+        } else {
+            for (k, value) in values.iter_mut().enumerate() {
+                if task.first + k < c.colored {
+                    *value = c.colors[start + k];
+                } else if task.first + k < c.total {
+                    *value = splat.depth;
+                }
+            }
+        }
+        Self {
+            w11: splat.w11,
+            w12: splat.w12,
+            u0: -(splat.w11 * x + splat.w12 * y),
+            w22: splat.w22,
+            v0: -(splat.w22 * y),
+            opacity: splat.opacity,
+            place: T::ordinal(index as u32),
+            values,
+        }
+    }
+
+    #[inline(always)]
+    fn whitened<V: Vector<Scalar = T>>(&self, x: V, y: V) -> (V, V) {
+        let u = V::splat(self.w12).times_plus(y, V::splat(self.u0));
+        (
+            V::splat(self.w11).times_plus(x, u),
+            V::splat(self.w22).times_plus(y, V::splat(self.v0)),
+        )
+    }
+}
+
+impl<T: Real> TileTask<'_, T> {
+    /// Centre of a splat from the tile's corner.
+    #[inline(always)]
+    fn centre(&self, splat: &Splat<T>) -> (T, T) {
+        (
+            splat.x - T::of(self.origin.0 as f64),
+            splat.y - T::of(self.origin.1 as f64),
+        )
+    }
+}
+
+/// 2^−(u² + v²)
+#[inline(always)]
+fn falloff<V: Vector>(u: V, v: V) -> V {
+    let negative = V::splat(V::Scalar::ZERO).minus(v.times(v));
+    u.times_from(u, negative).exp2()
+}
+
+/// Pixel centres of every block from the tile's corner.
+struct PixelCentres<T> {
+    x: TilePlane<T>,
+    y: TilePlane<T>,
+}
+
+impl<T: Real> PixelCentres<T> {
+    #[inline(always)]
+    fn new(side: usize) -> Self {
+        let centre = |at: usize, lane: usize| T::of((at * BLOCK + lane) as f64 + 0.5);
+        Self {
+            x: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| centre(b % side, i % BLOCK)))),
+            y: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| centre(b / side, i / BLOCK)))),
+        }
+    }
+}

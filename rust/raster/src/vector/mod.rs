@@ -1,0 +1,169 @@
+//! Vectors of floats, one type per instruction set, behind one trait: what the kernels are written in.
+//!
+//! Methods are safe to call because a type is only ever named where its instructions are known to exist: `dispatch`
+//! enters a kernel with it after detecting them, inside a function compiled for them. Every method is inlined there.
+
+#[cfg(target_arch = "aarch64")]
+mod neon;
+#[cfg(any(test, not(any(target_arch = "x86_64", target_arch = "aarch64"))))]
+pub(crate) mod portable;
+#[cfg(test)]
+mod tests;
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
+use crate::real::Real;
+
+/// Values that [`Vector::sums`] takes at most.
+pub(crate) const MAX_SUMS: usize = 16;
+
+/// `LANES` floats, and comparisons of them.
+///
+/// `min` and `max` yield `other` if self is NaN.
+#[allow(unreachable_pub, missing_docs)]
+pub trait Vector: Copy {
+    type Scalar: Real;
+    /// True or false per lane.
+    type Mask: Copy;
+    const LANES: usize;
+
+    fn splat(value: Self::Scalar) -> Self;
+    /// The first `LANES` values.
+    fn load(values: &[Self::Scalar]) -> Self;
+    /// Into the first `LANES` values.
+    fn store(self, values: &mut [Self::Scalar]);
+
+    fn plus(self, other: Self) -> Self;
+    fn minus(self, other: Self) -> Self;
+    fn times(self, other: Self) -> Self;
+    fn over(self, other: Self) -> Self;
+    /// self · a + b, in one rounding where there is such an instruction.
+    fn times_plus(self, a: Self, b: Self) -> Self;
+    /// self · a − b
+    fn times_minus(self, a: Self, b: Self) -> Self;
+    /// b − self · a
+    fn times_from(self, a: Self, b: Self) -> Self;
+    fn min(self, other: Self) -> Self;
+    fn max(self, other: Self) -> Self;
+    /// 2^x for x ≤ 0; zero, or next to it, below the range of normal numbers.
+    fn exp2(self) -> Self;
+
+    /// self ≥ other
+    fn at_least(self, other: Self) -> Self::Mask;
+    /// self > other
+    fn above(self, other: Self) -> Self::Mask;
+    fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
+    /// One bit per lane, the first lane lowest.
+    fn bits(mask: Self::Mask) -> u32;
+    /// self where the mask holds, else `other`.
+    fn select(self, mask: Self::Mask, other: Self) -> Self;
+    /// self where the mask holds, else 0.
+    fn keep(self, mask: Self::Mask) -> Self;
+
+    /// The sum of the lanes of each of N ≤ `MAX_SUMS` vectors, in the same order of additions for each.
+    fn sums<const N: usize>(vectors: &[Self; N]) -> [Self::Scalar; MAX_SUMS];
+}
+
+/// The vector of each instruction set for a scalar.
+#[allow(unreachable_pub, missing_docs)]
+pub trait Vectors: Sized {
+    /// What the target guarantees.
+    type Baseline: Vector<Scalar = Self>;
+    #[cfg(target_arch = "x86_64")]
+    type Avx2: Vector<Scalar = Self>;
+    #[cfg(target_arch = "x86_64")]
+    type Avx512: Vector<Scalar = Self>;
+}
+
+macro_rules! vectors {
+    ($T:ty, $baseline:ty, $avx2:ty, $avx512:ty) => {
+        impl Vectors for $T {
+            type Baseline = $baseline;
+            #[cfg(target_arch = "x86_64")]
+            type Avx2 = $avx2;
+            #[cfg(target_arch = "x86_64")]
+            type Avx512 = $avx512;
+        }
+    };
+}
+#[cfg(target_arch = "x86_64")]
+vectors!(f32, x86::F32x4, x86::F32x8, x86::F32x16);
+#[cfg(target_arch = "x86_64")]
+vectors!(f64, x86::F64x2, x86::F64x4, x86::F64x8);
+#[cfg(target_arch = "aarch64")]
+vectors!(f32, neon::F32x4, (), ());
+#[cfg(target_arch = "aarch64")]
+vectors!(f64, neon::F64x2, (), ());
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+vectors!(f32, portable::Array<f32>, (), ());
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+vectors!(f64, portable::Array<f64>, (), ());
+
+/// 2^f on [-½, ½], f32: degree 5, minimax with c₀ = 1, relative error 9e-8. Fitted: c₁ is not ln 2.
+#[allow(clippy::approx_constant)]
+const EXP2_F32: [f32; 6] = [
+    1.0,
+    0.693_147,
+    0.240_222_42,
+    0.055_507_337,
+    0.009_671_513,
+    0.001_326_472_7,
+];
+/// 2^f on [0, 1], f32: likewise, relative error 8e-8, and its mean is zero.
+#[cfg(target_arch = "x86_64")]
+const EXP2_F32_FLOOR: [f32; 6] = [
+    1.0,
+    0.693_151_3,
+    0.240_164_44,
+    0.055_799_913,
+    0.009_017_031,
+    0.001_867_13,
+];
+/// 2^f on [-½, ½], f64: (ln 2)ᵏ / k! to degree 12, relative error 2e-16.
+const EXP2_F64: [f64; 13] = [
+    1.0,
+    std::f64::consts::LN_2,
+    0.240_226_506_959_100_7,
+    0.055_504_108_664_821_576,
+    0.009_618_129_107_628_477,
+    0.001_333_355_814_642_844_1,
+    0.000_154_035_303_933_816_06,
+    1.525_273_380_405_984e-5,
+    1.321_548_679_014_430_5e-6,
+    1.017_808_600_923_969_7e-7,
+    7.054_911_620_801_121e-9,
+    4.445_538_271_870_81e-10,
+    2.567_843_599_348_82e-11,
+];
+
+/// Horner's rule.
+#[inline(always)]
+fn polynomial<V: Vector, const N: usize>(x: V, coefficients: &[V::Scalar; N]) -> V {
+    let mut sum = V::splat(coefficients[N - 1]);
+    let mut k = N - 1;
+    while k > 0 {
+        k -= 1;
+        sum = sum.times_plus(x, V::splat(coefficients[k]));
+    }
+    sum
+}
+
+/// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word.
+#[inline(always)]
+pub(crate) fn transpose_bits(masks: &[u16; 64]) -> [u64; 16] {
+    #[cfg(target_arch = "x86_64")]
+    return x86::transpose_bits(masks);
+    #[cfg(not(target_arch = "x86_64"))]
+    transpose_bits_one_by_one(masks)
+}
+
+#[cfg(any(test, not(target_arch = "x86_64")))]
+fn transpose_bits_one_by_one(masks: &[u16; 64]) -> [u64; 16] {
+    std::array::from_fn(|b| {
+        let bits = masks
+            .iter()
+            .zip(0..)
+            .map(|(mask, i)| u64::from(mask >> b & 1) << i);
+        bits.fold(0, |word, bit| word | bit)
+    })
+}
