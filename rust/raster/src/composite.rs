@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::dispatch::{self, SimdLevel};
 use crate::kernel::{
-    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TileImage, TilePlane,
-    TileTask,
+    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_SIDE, MOMENTS, TileCotangents, TileImage,
+    TilePlane, TileTask,
 };
 use crate::project::Splat;
 use crate::real::Real;
@@ -16,8 +16,6 @@ use crate::tiles::{TileBins, TileGrid};
 
 /// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
 const LEAST_ALPHA: f64 = 1e-10;
-/// Most pixels along a side of a tile.
-const MAX_SIDE: usize = 16;
 
 /// What the backward pass needs of the composited tiles. Tile-major, a block of pixels in each `Lanes`.
 #[derive(Debug)]
@@ -192,7 +190,8 @@ pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>, colors: &mut [T], alphas:
         })
         .collect();
     let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
-    let planes = || vec![Lanes::ZERO; total * scene.blocks()];
+    // The kernel for the last group may have a channel more than is left.
+    let planes = || vec![Lanes::ZERO; (total + 1) * scene.blocks()];
     strips
         .into_par_iter()
         .flat_map(|strip| rayon::iter::split(strip, |strip| strip.halves(scene)))
@@ -233,7 +232,8 @@ fn composite_tile<T: Real>(
         }
     }
     if scene.expected_depth {
-        out.depths.copy_from_slice(&planes[(total - 1) * blocks..]);
+        out.depths
+            .copy_from_slice(&planes[(total - 1) * blocks..total * blocks]);
     }
     match total {
         1 => write_tile::<T, 1>(scene, background, planes, &mut out),

@@ -100,7 +100,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize>(
     let zero = V::Scalar::ZERO;
     let blocks = task.side * task.side;
     let used = (task.channels.total - task.first).min(K);
-    let centres = PixelCentres::new(task.side);
+    let centres = PixelCentres::new(task);
     let mut state = [Block {
         x: Lanes::ZERO,
         y: Lanes::ZERO,

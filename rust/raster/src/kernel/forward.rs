@@ -10,7 +10,7 @@ const BATCH: usize = 2 * WORD;
 
 /// What forward leaves of a tile; pixels in block order. What is in it before does not matter.
 pub(crate) struct TileImage<'a, T> {
-    /// For each of the channels handled now a plane of blocks.
+    /// For each of the kernel's channels, which may be one more than are handled now, a plane of blocks.
     pub(crate) colors: &'a mut [Lanes<T>],
     /// Transmittance behind everything.
     pub(crate) transmittance: &'a mut [Lanes<T>],
@@ -66,8 +66,8 @@ pub(crate) fn forward_tile<V: Vector, const K: usize>(
     out: TileImage<'_, V::Scalar>,
 ) {
     let blocks = task.side * task.side;
-    let block_centres = BlockCentres::new(task.side);
-    let centres = PixelCentres::new(task.side);
+    let block_centres = BlockCentres::new(task);
+    let centres = PixelCentres::new(task);
     let rules = Rules {
         threshold: V::splat(task.threshold()),
         max_alpha: V::splat(task.limits.max_alpha),

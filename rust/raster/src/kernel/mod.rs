@@ -25,7 +25,9 @@ use crate::vector::Vector;
 pub(crate) const LANES: usize = 16;
 /// Pixels along a side of a block.
 pub(crate) const BLOCK: usize = 4;
-/// Most blocks in a tile (tiles of 16×16).
+/// Most pixels along a side of a tile.
+pub(crate) const MAX_SIDE: usize = 16;
+/// Most blocks in a tile.
 pub(crate) const MAX_BLOCKS: usize = 16;
 /// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv.
 pub(crate) const MOMENTS: usize = 6;
@@ -88,6 +90,28 @@ pub(crate) struct TileTask<'a, T> {
 }
 
 impl<T: Real> TileTask<'_, T> {
+    /// Where coordinates of the kernels have their zero: the middle of the 16×16 pixels around the tile. Small
+    /// coordinates round least, and an anchor that is the same for tiles of any size gives the same bits for each.
+    #[inline(always)]
+    fn anchor(&self) -> [T; 2] {
+        let middle = |first: usize| T::of((first - first % MAX_SIDE + MAX_SIDE / 2) as f64);
+        [middle(self.origin.0), middle(self.origin.1)]
+    }
+
+    /// The first pixel centre of the tile, from its anchor.
+    #[inline(always)]
+    fn first_centre(&self) -> [T; 2] {
+        let first = |first: usize| T::of((first % MAX_SIDE) as f64 + 0.5 - (MAX_SIDE / 2) as f64);
+        [first(self.origin.0), first(self.origin.1)]
+    }
+
+    /// Centre of a splat from the tile's anchor.
+    #[inline(always)]
+    fn centre(&self, splat: &Splat<T>) -> [T; 2] {
+        let [x, y] = self.anchor();
+        [splat.x - x, splat.y - y]
+    }
+
     /// Alpha from which a pair counts; a limit of alpha below the threshold lets none count.
     #[inline(always)]
     fn threshold(&self) -> T {
@@ -99,7 +123,7 @@ impl<T: Real> TileTask<'_, T> {
     }
 }
 
-/// A splat as a tile sees it: (u, v) = (w11 x + w12 y + u0, w22 y + v0) at (x, y) from the tile's corner, and the
+/// A splat as a tile sees it: (u, v) = (w11 x + w12 y + u0, w22 y + v0) at (x, y) from the tile's anchor, and the
 /// values of K channels. One cache line in f32.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
@@ -131,7 +155,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
     fn load(task: &TileTask<'_, T>, index: usize) -> Self {
         let rank = task.ranks[index] as usize;
         let splat = &task.splats[rank];
-        let (x, y) = task.centre(splat);
+        let [x, y] = task.centre(splat);
         let mut values = [T::ZERO; K];
         let c = &task.channels;
         let start = task.ids[rank] as usize * c.stride + task.first;
@@ -168,17 +192,6 @@ impl<T: Real, const K: usize> Entry<T, K> {
     }
 }
 
-impl<T: Real> TileTask<'_, T> {
-    /// Centre of a splat from the tile's corner.
-    #[inline(always)]
-    fn centre(&self, splat: &Splat<T>) -> (T, T) {
-        (
-            splat.x - T::of(self.origin.0 as f64),
-            splat.y - T::of(self.origin.1 as f64),
-        )
-    }
-}
-
 /// 2^−(u² + v²)
 #[inline(always)]
 fn falloff<V: Vector>(u: V, v: V) -> V {
@@ -186,7 +199,7 @@ fn falloff<V: Vector>(u: V, v: V) -> V {
     u.times_from(u, negative).exp2()
 }
 
-/// Pixel centres of every block from the tile's corner.
+/// Pixel centres of every block from the tile's anchor.
 struct PixelCentres<T> {
     x: TilePlane<T>,
     y: TilePlane<T>,
@@ -194,11 +207,12 @@ struct PixelCentres<T> {
 
 impl<T: Real> PixelCentres<T> {
     #[inline(always)]
-    fn new(side: usize) -> Self {
-        let centre = |at: usize, lane: usize| T::of((at * BLOCK + lane) as f64 + 0.5);
+    fn new(task: &TileTask<'_, T>) -> Self {
+        let ([x, y], side) = (task.first_centre(), task.side);
+        let offset = |at: usize, lane: usize| T::of((at * BLOCK + lane) as f64);
         Self {
-            x: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| centre(b % side, i % BLOCK)))),
-            y: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| centre(b / side, i / BLOCK)))),
+            x: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| x + offset(b % side, i % BLOCK)))),
+            y: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| y + offset(b / side, i / BLOCK)))),
         }
     }
 }

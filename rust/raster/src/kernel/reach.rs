@@ -1,12 +1,12 @@
 //! Which blocks of a tile a splat reaches.
 
-use super::{BLOCK, LANES, Lanes};
+use super::{BLOCK, LANES, Lanes, TileTask};
 use crate::project::Splat;
 use crate::real::Real;
 use crate::tiles::padded_reach;
 use crate::vector::Vector;
 
-/// First pixel centres of every block of a tile, from its corner.
+/// First pixel centres of every block of a tile, from its anchor.
 pub(super) struct BlockCentres<T> {
     x: Lanes<T>,
     y: Lanes<T>,
@@ -16,10 +16,12 @@ pub(super) struct BlockCentres<T> {
 
 impl<T: Real> BlockCentres<T> {
     #[inline(always)]
-    pub(super) fn new(side: usize) -> Self {
+    pub(super) fn new(task: &TileTask<'_, T>) -> Self {
+        let ([x, y], side) = (task.first_centre(), task.side);
+        let offset = |at: usize| T::of((at * BLOCK) as f64);
         Self {
-            x: Lanes(std::array::from_fn(|b| T::of((b % side * BLOCK) as f64 + 0.5))),
-            y: Lanes(std::array::from_fn(|b| T::of((b / side * BLOCK) as f64 + 0.5))),
+            x: Lanes(std::array::from_fn(|b| x + offset(b % side))),
+            y: Lanes(std::array::from_fn(|b| y + offset(b / side))),
             mask: ((1u32 << (side * side)) - 1) as u16,
         }
     }
@@ -29,7 +31,7 @@ impl<T: Real> BlockCentres<T> {
     ///
     /// The least of the form over a box that does not hold the centre lies on one of the two edges that face it.
     #[inline(always)]
-    pub(super) fn reached<V: Vector<Scalar = T>>(&self, splat: &Splat<T>, (x, y): (T, T)) -> u16 {
+    pub(super) fn reached<V: Vector<Scalar = T>>(&self, splat: &Splat<T>, [x, y]: [T; 2]) -> u16 {
         let (w11, w12, w22) = (V::splat(splat.w11), V::splat(splat.w12), V::splat(splat.w22));
         let reach = V::splat(padded_reach(splat.reach));
         // On a vertical line the form is least at dy = −(w11 w12 / (w12² + w22²)) dx, on a horizontal one at
