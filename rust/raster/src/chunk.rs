@@ -14,6 +14,9 @@ pub(crate) const CHUNK: usize = 256;
 /// Loops run over whole vectors; what is left over in a column is ignored.
 const LANES: usize = 16;
 
+/// Radii up to this many pixels are rounded in columns.
+const MOST_EXACT: f64 = 4e6;
+
 type Column<U> = [U; CHUNK];
 
 /// The Gaussians of a chunk: mean, quaternion, scale, opacity.
@@ -59,7 +62,7 @@ fn whole_vectors(len: usize) -> usize {
 
 /// Where the splats of a chunk go.
 pub(crate) struct ChunkSplats<'a, T> {
-    /// By Gaussian; zeros for one that no pixel sees.
+    /// By Gaussian; anything for one that no pixel sees.
     pub(crate) splats: &'a mut [Splat<T>],
     pub(crate) screen: ScreenInfo<'a, T>,
     pub(crate) cover: &'a mut Cover,
@@ -85,8 +88,8 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
     let [mut xs, mut ys, mut depths, mut opacities, mut reaches] = [zero; 5];
     let [mut w11s, mut w12s, mut w22s, mut rxs, mut rys] = [zero; 5];
     let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
-    let (mut tops, mut bottoms, mut seen) = ([0u32; CHUNK], [0u32; CHUNK], [0u32; CHUNK]);
-    let height = T::of(grid.height as f64);
+    let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; CHUNK]; 5];
+    let (height, most) = (T::of(grid.height as f64), T::of(MOST_EXACT));
     // Tile sizes are powers of two; a division would cost more than all the rest.
     let shift = grid.tile_size.trailing_zeros();
     for lane in 0..whole_vectors(len) {
@@ -97,6 +100,8 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
         (opacities[lane], reaches[lane]) = (s.opacity, s.reach);
         [rxs[lane], rys[lane]] = o.radii;
+        let [ceil_x, ceil_y] = o.radii.map(|r| r.lesser(most).ceiling());
+        (ceil_xs[lane], ceil_ys[lane]) = (ceil_x, ceil_y);
         seen[lane] = u32::from(o.visible);
 
         let reach = padded_reach(s.reach);
@@ -126,7 +131,6 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
     let mut cutter = Cutter::new(grid, wanted);
     for lane in 0..len.min(CHUNK) {
         if seen[lane] == 0 {
-            out.splats[lane] = Splat::default();
             (means2d[lane], camera_zs[lane], radii[lane]) = ([T::ZERO; 2], T::ZERO, [0; 2]);
             continue;
         }
@@ -144,8 +148,11 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         };
         means2d[lane] = [x, y];
         camera_zs[lane] = depth;
-        // The cast saturates, so an unbounded Gaussian gets the largest integer.
-        radii[lane] = [rxs[lane], rys[lane]].map(|r| r.as_f64().ceil() as i32);
+        radii[lane] = [ceil_xs[lane] as i32, ceil_ys[lane] as i32];
+        if rxs[lane].greater(rys[lane]) >= most {
+            // The cast saturates, so an unbounded Gaussian gets the largest integer.
+            radii[lane] = [rxs[lane], rys[lane]].map(|r| r.as_f64().ceil() as i32);
+        }
         let ellipse = Ellipse {
             x,
             y,

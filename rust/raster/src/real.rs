@@ -48,8 +48,10 @@ pub trait Real:
     fn abs(self) -> Self;
     /// log₂ x for a positive normal x, without branches.
     fn log2(self) -> Self;
-    /// ⌊x⌋ for 0 ≤ x < 2³¹.
-    fn truncate(self) -> usize;
+    /// The nearest integer to x, for 0 ≤ x ≤ 2²², without branches.
+    fn nearest(self) -> u32;
+    /// ⌈x⌉, likewise.
+    fn ceiling(self) -> u32;
     /// Neither NaN nor infinite.
     fn is_finite(self) -> bool;
     /// self · a + b in one rounding; slow where the CPU has no such instruction.
@@ -120,8 +122,16 @@ macro_rules! real {
                 exponent as $T + s * sum
             }
             #[inline(always)]
-            fn truncate(self) -> usize {
-                self as i32 as usize
+            fn nearest(self) -> u32 {
+                // Adding 2ᵐ leaves the integer in the low bits of the mantissa.
+                let magic = (1u64 << $mantissa) as $T;
+                (self + magic).to_bits() as u32 & 0x7F_FFFF
+            }
+            #[inline(always)]
+            fn ceiling(self) -> u32 {
+                let magic = (1u64 << $mantissa) as $T;
+                let nearest = (self + magic) - magic;
+                self.nearest() + u32::from(nearest < self)
             }
             #[inline(always)]
             fn is_finite(self) -> bool {
@@ -176,6 +186,30 @@ mod tests {
             x *= 1.003;
         }
         assert_eq!((Real::log2(1f32), Real::log2(8f64)), (0.0, 3.0));
+    }
+
+    #[test]
+    fn integers_are_exact() {
+        for x in [
+            0.0,
+            0.25,
+            0.75,
+            1.0,
+            1e-30,
+            41.01,
+            4096.999,
+            4_194_303.6,
+            4_194_304.0,
+        ] {
+            assert_eq!(Real::nearest(x), x.round() as u32, "{x}");
+            assert_eq!(Real::ceiling(x), x.ceil() as u32, "{x}");
+            let x = x as f32;
+            assert_eq!(
+                (x.nearest(), x.ceiling()),
+                (x.round() as u32, x.ceil() as u32),
+                "{x}"
+            );
+        }
     }
 
     #[test]

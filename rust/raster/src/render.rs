@@ -35,7 +35,7 @@ pub(crate) struct Image<'a, T> {
 /// A view's splats and which tiles they reach.
 #[derive(Debug)]
 pub(crate) struct Binned<T> {
-    /// By Gaussian; zeros for one that no pixel sees.
+    /// By Gaussian; anything for one that no pixel sees.
     pub(crate) splats: Vec<Splat<T>>,
     /// 0, 1, 2, … as far as any view needed: the Gaussian of each splat.
     ids: Vec<u32>,

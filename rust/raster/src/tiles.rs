@@ -52,28 +52,14 @@ pub(crate) fn padded_reach<T: Real>(reach: T) -> T {
     reach * T::of(1.001) + T::of(0.01)
 }
 
-/// Tiles next to each other in a row that one splat reaches.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Span {
-    pub(crate) first: u32,
-    pub(crate) count: u32,
-}
-
-impl Span {
-    fn tiles(self) -> std::ops::Range<usize> {
-        self.first as usize..(self.first + self.count) as usize
-    }
-}
-
 /// First and one-past-last pixel with its centre in [low, high]; not in order if there is none.
 #[inline(always)]
 pub(crate) fn pixel_range<T: Real>(low: T, high: T, pixels: T) -> (u32, u32) {
-    // Centre i + ½ is in if low − ½ ≤ i ≤ high − ½, with slack; adding not quite 1 to the first rounds up.
-    let (ceiling, slack) = (T::of(0.99), T::of(0.01));
-    let half = T::of(0.5);
-    let first = (low - half - slack + ceiling).limit(T::ZERO, pixels).truncate();
-    let past = (high + half + slack).limit(T::ZERO, pixels).truncate();
-    (first as u32, past as u32)
+    // Centre i + ½ is in if low − ½ ≤ i ≤ high − ½. Rounding to the nearest with a little slack outwards.
+    let slack = T::of(0.02);
+    let first = (low - slack).limit(T::ZERO, pixels).nearest();
+    let past = (high + slack).limit(T::ZERO, pixels).nearest();
+    (first, past)
 }
 
 /// Rows of tiles waiting to be cut out of ellipses together.
@@ -158,10 +144,10 @@ impl<'a, T: Real> Cutter<'a, T> {
         }
     }
 
-    /// Writes the spans of the rows that wait.
+    /// Lists the tiles of the rows that wait.
     #[inline(always)]
     pub(crate) fn flush(&mut self, cover: &mut Cover) {
-        let (mut firsts, mut pasts) = ([0u32; ROWS], [0u32; ROWS]);
+        let (mut firsts, mut counts) = ([0u32; ROWS], [0u32; ROWS]);
         let tall = T::of(self.grid.tile_size as f64 - 1.0);
         let width = T::of(self.grid.width as f64);
         // Tile sizes are powers of two; a division would cost more than all the rest.
@@ -181,36 +167,14 @@ impl<'a, T: Real> Cutter<'a, T> {
             let left = xs[i] + slopes[i] * left_at - half_width(left_at);
             let right = xs[i] + slopes[i] * right_at + half_width(right_at);
             let (first, past) = pixel_range(left, right, width);
-            firsts[i] = first >> shift;
-            pasts[i] = if first < past {
-                ((past - 1) >> shift) + 1
-            } else {
-                0
-            };
+            firsts[i] = self.rows[i] + (first >> shift);
+            let count = (past.wrapping_sub(1) >> shift)
+                .wrapping_sub(first >> shift)
+                .wrapping_add(1);
+            counts[i] = if first < past { count } else { 0 };
         }
-        for i in 0..self.used {
-            let (row, owner) = (self.rows[i], self.owners[i] as usize);
-            if pasts[i] <= firsts[i] {
-                continue;
-            }
-            let span = Span {
-                first: row + firsts[i],
-                count: pasts[i] - firsts[i],
-            };
-            match self.wanted {
-                None => cover.push(owner, span),
-                Some(wanted) => {
-                    for tile in span.tiles().filter(|&tile| wanted[tile]) {
-                        cover.push(
-                            owner,
-                            Span {
-                                first: tile as u32,
-                                count: 1,
-                            },
-                        );
-                    }
-                }
-            }
+        for i in 0..self.used.min(ROWS) {
+            cover.push(self.owners[i] as usize, firsts[i], counts[i], self.wanted);
         }
         self.used = 0;
     }
@@ -219,10 +183,11 @@ impl<'a, T: Real> Cutter<'a, T> {
 /// Which tiles a chunk of Gaussians reaches.
 #[derive(Debug, Default)]
 pub(crate) struct Cover {
-    /// Gaussian by Gaussian.
-    spans: Vec<Span>,
-    /// Where the spans and the (Gaussian, tile) pairs of each Gaussian of the chunk begin, and where the last end.
-    begins: Vec<[u32; 2]>,
+    /// Gaussian by Gaussian; what lies behind `end` is to be overwritten.
+    tiles: Vec<u32>,
+    end: usize,
+    /// Where in `tiles` those of each Gaussian of the chunk begin, and where the last end.
+    begins: Vec<u32>,
     /// Gaussians of the chunk that some pixel may see.
     pub(crate) visible: usize,
     /// (Gaussian, tile) pairs of all chunks before this one.
@@ -231,7 +196,7 @@ pub(crate) struct Cover {
 
 impl Cover {
     pub(crate) fn bytes(&self) -> usize {
-        bytes_of(&self.spans) + bytes_of(&self.begins)
+        bytes_of(&self.tiles) + bytes_of(&self.begins)
     }
 
     /// Gaussians in the chunk.
@@ -241,44 +206,65 @@ impl Cover {
 
     /// Starts over for `len` Gaussians.
     pub(crate) fn clear(&mut self, len: usize) {
-        self.spans.clear();
-        filled(&mut self.begins, len + 1, [0; 2]);
+        self.end = 0;
+        filled(&mut self.begins, len + 1, 0);
     }
 
+    /// Adds consecutive tiles to those of a Gaussian, which must not come before those added earlier.
     #[inline(always)]
-    fn push(&mut self, owner: usize, span: Span) {
-        self.spans.push(span);
-        let counts = &mut self.begins[owner + 1];
-        *counts = [counts[0] + 1, counts[1].saturating_add(span.count)];
+    fn push(&mut self, owner: usize, first: u32, count: u32, wanted: Option<&[bool]>) {
+        /// Tiles written at once, needed or not: how many are is hard for a branch to predict.
+        const AT_ONCE: usize = 8;
+        let end = self.end + count as usize;
+        if self.tiles.len() < end + AT_ONCE {
+            self.tiles.resize((end + AT_ONCE).max(2 * self.tiles.len()), 0);
+        }
+        if let Some(wanted) = wanted {
+            for tile in (first..first + count).filter(|&tile| wanted[tile as usize]) {
+                self.tiles[self.end] = tile;
+                self.end += 1;
+            }
+        } else {
+            let mut tile = first;
+            for tiles in self.tiles[self.end..end + AT_ONCE].chunks_exact_mut(AT_ONCE) {
+                for (k, place) in tiles.iter_mut().enumerate() {
+                    *place = tile + k as u32;
+                }
+                tile += AT_ONCE as u32;
+            }
+            self.end = end;
+        }
+        self.begins[owner + 1] = self.end as u32;
     }
 
-    /// Turns counts into beginnings.
+    /// Completes the beginnings: Gaussians that reach nothing begin where the one before ends.
     pub(crate) fn finish(&mut self) {
-        let mut sum = [0u32; 2];
+        let mut last = 0;
         for begin in &mut self.begins {
-            sum = [sum[0] + begin[0], sum[1].saturating_add(begin[1])];
-            *begin = sum;
+            last = last.max(*begin);
+            *begin = last;
         }
     }
 
-    /// How many (Gaussian, tile) pairs, at most 2³² − 1.
-    fn pairs(&self) -> u32 {
-        self.begins.last().map_or(0, |begin| begin[1])
+    /// (Gaussian, tile) pairs of the chunk.
+    fn pairs(&self) -> &[u32] {
+        &self.tiles[..self.end]
     }
 
     /// Whether a Gaussian of the chunk reaches any tile.
+    #[inline(always)]
     pub(crate) fn reaches(&self, local: usize) -> bool {
-        self.begins[local][0] < self.begins[local + 1][0]
+        self.begins[local] < self.begins[local + 1]
     }
 
-    fn spans_of(&self, local: usize) -> &[Span] {
-        &self.spans[self.begins[local][0] as usize..self.begins[local + 1][0] as usize]
+    fn tiles_of(&self, local: usize) -> &[u32] {
+        &self.tiles[self.begins[local] as usize..self.begins[local + 1] as usize]
     }
 
     /// Where a Gaussian's own part of [`TileBins::positions`] is.
     #[inline(always)]
     pub(crate) fn pairs_of(&self, local: usize) -> std::ops::Range<usize> {
-        (self.base + self.begins[local][1]) as usize..(self.base + self.begins[local + 1][1]) as usize
+        (self.base + self.begins[local]) as usize..(self.base + self.begins[local + 1]) as usize
     }
 }
 
@@ -348,18 +334,14 @@ pub(crate) fn count_pairs(
     let mut total = 0u32;
     for cover in covers.iter_mut() {
         cover.base = total;
-        total = total
-            .checked_add(cover.pairs())
+        total = u32::try_from(cover.end)
+            .ok()
+            .and_then(|pairs| total.checked_add(pairs))
             .ok_or(RasterError::TooManyIntersections)?;
     }
-    if total == u32::MAX {
-        return Err(RasterError::TooManyIntersections);
-    }
     let offsets = filled(&mut bins.offsets, tiles + 1, 0);
-    for span in covers.iter().flat_map(|cover| &cover.spans) {
-        for count in &mut offsets[1..][span.tiles()] {
-            *count += 1;
-        }
+    for &tile in covers.iter().flat_map(Cover::pairs) {
+        offsets[tile as usize + 1] += 1;
     }
     let mut sum = 0;
     for offset in offsets {
@@ -378,14 +360,12 @@ pub(crate) fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut BinScratch<T>, 
     scratch.next.extend_from_slice(&bins.offsets);
     for &(_, i) in &scratch.order {
         let (cover, local) = (&covers[i as usize / CHUNK], i as usize % CHUNK);
-        let mut own = positions[cover.pairs_of(local)].iter_mut();
-        for span in cover.spans_of(local) {
-            // The span first: taking from the other first would lose a position.
-            for (slot, position) in scratch.next[span.tiles()].iter_mut().zip(&mut own) {
-                ranks[*slot as usize] = i;
-                *position = *slot;
-                *slot += 1;
-            }
+        let own = &mut positions[cover.pairs_of(local)];
+        for (position, &tile) in own.iter_mut().zip(cover.tiles_of(local)) {
+            let slot = &mut scratch.next[tile as usize];
+            ranks[*slot as usize] = i;
+            *position = *slot;
+            *slot += 1;
         }
     }
 }
