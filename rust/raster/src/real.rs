@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn integers_are_exact() {
         for x in [
-            0.0,
+            0.0f64,
             0.25,
             0.75,
             1.0,
