@@ -44,6 +44,9 @@ _Counts = tuple[tuple[int, int], ...]
 class RasterState:
     """What the forward pass keeps for the backward pass. Opaque; usable any number of times."""
 
+    def median_ids(self, lead: tuple[int, ...], width: int, height: int) -> NDArray[np.int32]:
+        """For every pixel the Gaussian at which half its light is gone, or −1: [*lead, height, width]."""
+
     def counters(self) -> dict[str, int]:
         """Work done and skipped in the forward pass, summed over the views."""
 
@@ -80,9 +83,10 @@ def rasterize_backward(
     NDArray[Any],
     NDArray[Any],
     NDArray[Any],
+    NDArray[Any],
     int,
 ]:
-    """Flat gradients of the seven differentiable inputs and of means2d; how many tiles had no gradient."""
+    """Flat gradients of the seven differentiable inputs, of means2d, its absolute form, and tiles skipped."""
 
 # dirs [.., N, 3], coeffs [N, K, 3], mask [.., N] of bool or None: all Gaussians of one place, then the next.
 _HarmonicsArrays = tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]

@@ -40,6 +40,8 @@ def rasterization(
     render_mode: RenderMode = "RGB",
     camera_model: CameraModel = "pinhole",
     means2d: Means2d = "values",
+    absgrad: bool = False,
+    median_depth: bool = False,
     backend: Backend = "auto",
 ) -> RenderOutput:
     """Render 3D Gaussians (paper Eq. 1 and 2) into C cameras, differentiably.
@@ -73,6 +75,11 @@ def rasterization(
         means2d: what `info["means2d"]` is: mere "values", or a part of the graph with a `.grad` (per pixel)
             after `retain_grad()`, as densification needs: "full", or "packed" [nnz, 2] without those that no
             pixel sees. Backend "torch" has values only.
+        absgrad: the backward pass leaves `info["means2d"].absgrad`, sums over pixels of absolute gradients
+            (AbsGS), of up to eight channels at a time. Needs means2d other than "values".
+        median_depth: adds `info["render_median"]` [..., C, H, W, 1]: camera z of the last Gaussian that more
+            than half of a pixel's light reaches, 0 for none, differentiable in means and viewmats, as in 2D
+            Gaussian splatting. And `info["median_ids"]` [..., C, H, W], -1 for none. Not for "gsplat".
         backend: "rust" (CPU), "torch" (slow and obvious), "gsplat" (CUDA), or "auto": rust for CPU tensors,
             gsplat for CUDA tensors.
 
@@ -93,6 +100,8 @@ def rasterization(
     check_choice("camera_model", camera_model, ("pinhole", "ortho"))
     check_choice("means2d", means2d, ("values", "full", "packed"))
     check_choice("backend", backend, ("auto", "rust", "torch", "gsplat"))
+    if absgrad and means2d == "values":
+        raise InputError("absgrad: expected means2d 'full' or 'packed' with it, found 'values'")
     tensors = {
         "means": means,
         "quats": quats,
@@ -123,7 +132,7 @@ def rasterization(
                 settings,
                 render_mode,
                 camera_model,
-                means2d,
+                rust.Extras(means2d, absgrad, median_depth),
             )
         except ValueError as error:
             # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
@@ -137,6 +146,8 @@ def rasterization(
     expanded = _expanded(tensors, batch)
     mask = None if pixel_mask is None else pixel_mask.expand(*batch.shape, *pixel_mask.shape[-3:])
     if backend == "gsplat":
+        if median_depth:
+            raise InputError("median_depth: expected False for backend 'gsplat', which has none")
         return RenderOutput(
             *cuda.rasterize(
                 expanded,
@@ -148,12 +159,18 @@ def rasterization(
                 camera_model,
                 sh_degree,
                 packed=means2d == "packed",
+                absgrad=absgrad,
             )
         )
     if means2d != "values":
         raise InputError(f"means2d: expected 'values' for backend 'torch', found '{means2d}'")
     return _render_torch(
-        *_with_view_colors(expanded, batch, reference.harmonics), mask, settings, render_mode, camera_model
+        *_with_view_colors(expanded, batch, reference.harmonics),
+        mask,
+        settings,
+        render_mode,
+        camera_model,
+        median_depth,
     )
 
 
@@ -292,7 +309,7 @@ def _render_rust(
     settings: RasterSettings,
     render_mode: RenderMode,
     camera_model: CameraModel,
-    means2d: Means2d,
+    extras: rust.Extras,
 ) -> RenderOutput:
     # Axes of each input's own, in the engine's order, and whether the camera's comes before them.
     axes = {
@@ -328,7 +345,7 @@ def _render_rust(
         render_mode,
         camera_model,
     )
-    return RenderOutput(*rust.rasterize(tuple(inputs), call, means2d))
+    return RenderOutput(*rust.rasterize(tuple(inputs), call, extras))
 
 
 def _expanded(tensors: dict[str, torch.Tensor], batch: _Batch) -> dict[str, torch.Tensor]:
@@ -351,6 +368,7 @@ def _render_torch(
     settings: RasterSettings,
     render_mode: RenderMode,
     camera_model: CameraModel,
+    median_depth: bool,
 ) -> RenderOutput:
     results = []
     for index in np.ndindex(*batch.shape, batch.cameras):
@@ -376,12 +394,13 @@ def _render_torch(
         )
     lead = (*batch.shape, batch.cameras)
     images, alphas, infos = zip(*results, strict=True)
+    if not median_depth:
+        infos = tuple({k: v for k, v in i.items() if "median" not in k} for i in infos)
     info = {
-        name: torch.stack([i[name].detach() for i in infos]).reshape(*lead, *infos[0][name].shape)
-        for name in infos[0]
+        name: torch.stack([i[name] for i in infos]).reshape(*lead, *infos[0][name].shape) for name in infos[0]
     }
     return RenderOutput(
         torch.stack(images).reshape(*lead, *images[0].shape),
         torch.stack(alphas).reshape(*lead, *alphas[0].shape),
-        {"tile_size": settings.tile_size, **info},
+        {"tile_size": settings.tile_size, **info, "means2d": info["means2d"].detach()},
     )

@@ -37,6 +37,7 @@ def rasterize(
     sh_degree: int | None,
     *,
     packed: bool,
+    absgrad: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render checked inputs with equal batch axes, by the names of `bigs.raster.rasterization`.
 
@@ -67,6 +68,7 @@ def rasterize(
         camera_model=camera_model,
         sh_degree=sh_degree,
         packed=packed,
+        absgrad=absgrad,
     )
     if pixel_mask is not None:
         inside = pixel_mask[..., None]

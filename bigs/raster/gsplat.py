@@ -79,7 +79,6 @@ def rasterization(
     """
     _refuse(
         sparse_grad=sparse_grad,
-        absgrad=absgrad,
         distributed=distributed,
         covars=covars,
         with_ut=with_ut,
@@ -117,6 +116,7 @@ def rasterization(
         render_mode=render_mode,
         camera_model=camera_model,  # type: ignore[arg-type]
         means2d="packed" if packed else "full",
+        absgrad=absgrad,
     )
     return images, alphas, info if means.is_cuda else _meta(info, opacities, packed)
 

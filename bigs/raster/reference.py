@@ -52,7 +52,13 @@ def rasterize_view(
         channels.append(colors[screen.ids])
     if "D" in render_mode.split("+")[-1]:
         channels.append(screen.depths[:, None])
-    image, transmittance = _composite(screen, torch.cat(channels, dim=-1), width, height, settings)
+    image, transmittance, medians = _composite(screen, torch.cat(channels, dim=-1), width, height, settings)
+    if pixel_mask is not None:
+        medians = torch.where(pixel_mask.reshape(-1), medians, -1)
+    of_none = torch.tensor([-1], device=medians.device)  # what the index −1 picks
+    info["median_ids"] = torch.cat([screen.ids, of_none])[medians].reshape(height, width).int()
+    depths = torch.cat([screen.depths, screen.depths.new_zeros(1)])[medians]
+    info["render_median"] = depths.reshape(height, width, 1)
 
     behind = torch.zeros_like(image[:1])
     if background is not None and "RGB" in render_mode:
@@ -172,8 +178,12 @@ def _project(
 
 def _composite(
     screen: _Screen, values: torch.Tensor, width: int, height: int, settings: RasterSettings
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Blend values [M, D] front to back (paper Eq. 2): [H·W, D] and the transmittance left over [H·W]."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Blend values [M, D] front to back (paper Eq. 2).
+
+    Returns:
+        [H·W, D], the transmittance left over [H·W], and which of M is the median [H·W], −1 for none.
+    """
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).reshape(1, -1, 2).to(values) + 0.5
     offsets = pixels - screen.means2d[:, None, :]  # [M, P, 2]
@@ -186,7 +196,11 @@ def _composite(
     alphas = torch.where(live, alphas, torch.zeros_like(alphas))
     after = torch.cumprod(1 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after], dim=0)
-    return (alphas * before[:-1]).T @ values, before[-1]
+    # The last Gaussian that more than half the light reaches.
+    places = torch.arange(len(values), device=values.device)[:, None]
+    reached = torch.where((alphas > 0) & (before[:-1] > 0.5), places, -1)
+    medians = torch.cat([reached.new_full((1, reached.shape[1]), -1), reached]).amax(0)
+    return (alphas * before[:-1]).T @ values, before[-1], medians
 
 
 def harmonics(degree: int, dirs: torch.Tensor, coeffs: torch.Tensor) -> torch.Tensor:

@@ -21,6 +21,14 @@ Inputs = tuple[torch.Tensor | None, ...]
 Means2d = Literal["values", "full", "packed"]
 
 
+class Extras(NamedTuple):
+    """What is not part of an image."""
+
+    means2d: Means2d
+    absgrad: bool
+    median_depth: bool
+
+
 class Call(NamedTuple):
     """What the engine is told besides the arrays."""
 
@@ -51,12 +59,13 @@ class _Rasterize(torch.autograd.Function):
         arrays: Any,
         call: Call,
         info: dict[str, Any],
+        absgrad: bool,
         means2d: torch.Tensor | None,
         *inputs: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         # Saved to notice inputs changed in place before the backward pass; what it reads are the arrays.
         ctx.save_for_backward(means2d, *inputs)
-        ctx.call, ctx.arrays, ctx.state, ctx.info = call, arrays, state, info
+        ctx.call, ctx.arrays, ctx.state, ctx.info, ctx.absgrad = call, arrays, state, info, absgrad
         ctx.set_materialize_grads(False)
         return images
 
@@ -64,9 +73,9 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_colors: torch.Tensor | None, v_alphas: torch.Tensor | None) -> tuple:
         means2d, *inputs = ctx.saved_tensors
-        want_means2d, *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[5:]
+        want_means2d, *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[6:]
         call: Call = ctx.call
-        *gradients, v_backgrounds, v_means2d, tiles_skipped = _raster.rasterize_backward(
+        *gradients, v_backgrounds, v_means2d, absolute, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
             ctx.arrays,
             call.counts,
@@ -77,11 +86,15 @@ class _Rasterize(torch.autograd.Function):
             call.camera_model,
             None if v_colors is None else _array(v_colors),
             None if v_alphas is None else _array(v_alphas),
-            (*six, backgrounds, want_means2d),
+            (*six, backgrounds, want_means2d, ctx.absgrad and want_means2d),
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
+        if ctx.absgrad and want_means2d:
+            full, shown = torch.from_numpy(absolute).view(means2d.shape), ctx.info["means2d"]
+            # As gsplat leaves it: an attribute, in the layout that the caller sees.
+            shown.absgrad = full if shown.shape == full.shape else full[ctx.info["depths"] > 0]
         return (
-            *[None] * 5,
+            *[None] * 6,
             _gradient_of(means2d, want_means2d, v_means2d),
             *map(_gradient_of, inputs, six, gradients),
             None,
@@ -102,7 +115,7 @@ def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: np.ndarray
 
 
 def rasterize(
-    inputs: Inputs, call: Call, means2d: Means2d = "values"
+    inputs: Inputs, call: Call, extras: Extras
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render inputs whose shapes fit.
 
@@ -128,13 +141,17 @@ def rasterize(
         "radii": radii,
         **state.counters(),
     }
+    # Only backgrounds and the mask may be absent.
+    means, viewmats, Ks = (cast(torch.Tensor, inputs[i]) for i in (0, 5, 6))
     between = None
-    if means2d != "values":
-        # Only backgrounds and the mask may be absent.
-        means, viewmats, Ks = (cast(torch.Tensor, inputs[i]) for i in (0, 5, 6))
+    if extras.means2d != "values":
         seen = depths > 0
         packed = screen.centres(centres, seen, means, viewmats, Ks, call.camera_model)
         between = screen.everywhere(packed, seen)
-        info["means2d"] = packed if means2d == "packed" else between
-    images = _Rasterize.apply((colors, alphas), state, arrays, call, info, between, *inputs)
+        info["means2d"] = packed if extras.means2d == "packed" else between
+    if extras.median_depth:
+        ids = torch.from_numpy(state.median_ids(call.lead, call.width, call.height))
+        info["median_ids"] = ids
+        info["render_median"] = screen.depth_of(ids, means, viewmats)
+    images = _Rasterize.apply((colors, alphas), state, arrays, call, info, extras.absgrad, between, *inputs)
     return *images, info

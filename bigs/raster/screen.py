@@ -30,6 +30,18 @@ def everywhere(packed: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
     return full.index_put((seen,), packed)
 
 
+def depth_of(
+    ids: torch.Tensor,  # [..., C, H, W] of Gaussians, −1 for none
+    means: torch.Tensor,  # [..., N, 3]
+    viewmats: torch.Tensor,  # [..., C, 4, 4]
+) -> torch.Tensor:
+    """Camera z of the Gaussian named in each pixel, [..., C, H, W, 1]; 0 for none."""
+    depths = (means[..., None, :, :] * viewmats[..., 2, None, :3]).sum(-1) + viewmats[..., 2, None, 3]
+    flat = ids.reshape(*ids.shape[:-2], -1).long()
+    picked = depths.expand(*flat.shape[:-1], depths.shape[-1]).gather(-1, flat.clamp_min(0))
+    return torch.where(flat >= 0, picked, 0.0).reshape(*ids.shape, 1)
+
+
 class _Centres(torch.autograd.Function):
     @staticmethod
     def forward(

@@ -144,7 +144,8 @@ def test_what_is_not_supported_is_named(name, value):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_strategy_of_gsplat(packed):
+@pytest.mark.parametrize("absgrad", [True, False])
+def test_strategy_of_gsplat(packed, absgrad):
     strategy_module = pytest.importorskip(
         "gsplat.strategy", reason="runs gsplat's own densification if installed"
     )
@@ -160,7 +161,9 @@ def test_strategy_of_gsplat(packed):
         }
     )
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
-    strategy = strategy_module.DefaultStrategy(refine_start_iter=0, refine_every=2, grow_grad2d=1e-4)
+    strategy = strategy_module.DefaultStrategy(
+        refine_start_iter=0, refine_every=2, grow_grad2d=1e-4, absgrad=absgrad
+    )
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state(scene_scale=1.0)
     for step in range(4):
@@ -175,6 +178,7 @@ def test_strategy_of_gsplat(packed):
             inputs["width"],
             inputs["height"],
             packed=packed,
+            absgrad=absgrad,
         )
         strategy.step_pre_backward(params, optimizers, state, step, meta)
         (colors - 0.5).square().mean().backward()

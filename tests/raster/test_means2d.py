@@ -5,7 +5,7 @@ import torch
 from raster_scenes import DIFFERENTIABLE, SMOOTH, gradients, relative, scene, without_perspective
 
 from bigs.checks import InputError
-from bigs.raster import rasterization, reference
+from bigs.raster import RasterSettings, rasterization, reference
 
 
 def graph_of(inputs, **options):
@@ -16,17 +16,11 @@ def graph_of(inputs, **options):
     return leaves, loss, info
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gradient_is_the_twins(antialiased, dtype):
-    inputs = scene(n=60, width=40, height=30, dtype=dtype)
-    settings = SMOOTH.__class__(antialiased=antialiased)
-    _, loss, info = graph_of(inputs, settings=settings, means2d="full")
-    info["means2d"].retain_grad()
-    loss.backward()
+def twin_of(inputs, settings):
+    """Image, alphas and info of the twin in double precision, and the weights of `graph_of`."""
     single = {k: v[0] for k, v in inputs.items() if k in ("viewmats", "Ks", "backgrounds")}
     double = {k: v.double() if isinstance(v, torch.Tensor) else v for k, v in {**inputs, **single}.items()}
-    image, alphas, slow = reference.rasterize_view(
+    image, alphas, info = reference.rasterize_view(
         *(double[k].requires_grad_() for k in ("means", "quats", "scales", "opacities", "colors")),
         double["viewmats"],
         double["Ks"],
@@ -39,7 +33,21 @@ def test_gradient_is_the_twins(antialiased, dtype):
         "pinhole",
     )
     g = torch.Generator().manual_seed(3)
-    twin_loss = sum((x * torch.randn(x.shape, generator=g, dtype=dtype)).sum() for x in (image, alphas))
+    dtype = inputs["means"].dtype
+    weights = [torch.randn(x.shape, generator=g, dtype=dtype).double() for x in (image, alphas)]
+    return image, alphas, info, *weights
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradient_is_the_twins(antialiased, dtype):
+    inputs = scene(n=60, width=40, height=30, dtype=dtype)
+    settings = RasterSettings(antialiased=antialiased)
+    _, loss, info = graph_of(inputs, settings=settings, means2d="full")
+    info["means2d"].retain_grad()
+    loss.backward()
+    image, alphas, slow, v_image, v_alphas = twin_of(inputs, settings)
+    twin_loss = (image * v_image).sum() + (alphas * v_alphas).sum()
     (expected,) = torch.autograd.grad(twin_loss, slow["means2d"])
     assert relative(info["means2d"].grad[0], expected) < (1e-10 if dtype == torch.float64 else 2e-4)
     assert relative(info["means2d"][0], slow["means2d"]) < (1e-12 if dtype == torch.float64 else 1e-6)
@@ -107,3 +115,40 @@ def test_frozen_gaussians_still_have_a_gradient_on_screen():
     assert not info["means2d"].requires_grad
     images.sum().backward()
     assert colors.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 7])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_absolute_gradient_is_the_twins_pixel_by_pixel(channels, dtype):
+    inputs = scene(n=25, channels=channels, width=11, height=9, dtype=dtype)
+    _, loss, info = graph_of(inputs, means2d="full", absgrad=True)
+    info["means2d"].retain_grad()
+    loss.backward()
+    image, alphas, slow, v_image, v_alphas = twin_of(inputs, RasterSettings())
+    expected = torch.zeros_like(slow["means2d"])
+    for row in range(9):
+        for column in range(11):
+            at = row, column
+            pixel = (image[at] * v_image[at]).sum() + (alphas[at] * v_alphas[at]).sum()
+            expected += torch.autograd.grad(pixel, slow["means2d"], retain_graph=True)[0].abs()
+    assert relative(info["means2d"].absgrad[0], expected) < (1e-10 if dtype == torch.float64 else 2e-4)
+    assert (info["means2d"].absgrad >= info["means2d"].grad.abs() * (1 - 1e-4)).all()
+
+
+def test_absolute_gradients_change_nothing_else():
+    inputs = scene(n=80, cameras=2, spread=1.0)
+    found = {}
+    for layout, absgrad in (("full", False), ("full", True), ("packed", True)):
+        leaves, loss, info = graph_of(inputs, means2d=layout, absgrad=absgrad, render_mode="RGB+ED")
+        info["means2d"].retain_grad()
+        loss.backward()
+        found[layout, absgrad] = info["means2d"], [leaf.grad for leaf in leaves.values()]
+    plain, absolute, packed = found.values()
+    assert not hasattr(plain[0], "absgrad")
+    seen = absolute[0].absgrad.sum(-1) > 0
+    assert packed[0].absgrad.shape == packed[0].shape
+    assert torch.equal(packed[0].absgrad[packed[0].absgrad.sum(-1) > 0], absolute[0].absgrad[seen])
+    for a, b in zip(plain[1], absolute[1], strict=True):
+        assert relative(b, a) < 1e-12
+    with pytest.raises(InputError, match="absgrad: expected means2d 'full' or 'packed' with it"):
+        rasterization(**inputs, absgrad=True)

@@ -201,13 +201,15 @@ fn backward<'py, T: Scalar>(
         gradient(py, gradients.viewmats),
         gradient(py, gradients.backgrounds),
         gradient(py, gradients.means2d),
+        gradient(py, gradients.absgrad),
         gradients.tiles_skipped,
     )
         .into_pyobject(py)
 }
 
 /// Gradients of means, quats, scales, opacities, colors, viewmats (three rows of four) and backgrounds, flat, in the
-/// layout of their input, of means2d `[views, N, 2]`, and the number of tiles without incoming gradient. `wanted` has
+/// layout of their input, of means2d `[views, N, 2]`, its absolute form, and the number of tiles without incoming
+/// gradient. `wanted` has
 /// one flag per array; what is not wanted is an empty one. Where means2d is wanted, what passes through it is left out
 /// of means and viewmats. Gradients of the images may be None for zeros. Takes the inputs of the forward call that made
 /// `state`.
@@ -224,7 +226,7 @@ fn rasterize_backward<'py>(
     camera_model: &str,
     v_colors: Option<&Bound<'py, PyAny>>,
     v_alphas: Option<&Bound<'py, PyAny>>,
-    wanted: [bool; 8],
+    wanted: [bool; 9],
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, size) = (settings.into(), (width, height));
     let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
@@ -237,6 +239,7 @@ fn rasterize_backward<'py>(
         viewmats,
         backgrounds,
         means2d,
+        absgrad,
     ] = wanted;
     let wanted = Wanted {
         means,
@@ -248,6 +251,7 @@ fn rasterize_backward<'py>(
         backgrounds,
         means2d,
         detach_means2d: means2d,
+        absgrad,
     };
     let (v, kept) = ([v_colors, v_alphas], &state.get().kept);
     if let Some(state) = f32::kept(kept) {
@@ -281,6 +285,23 @@ fn rasterize_backward<'py>(
 
 #[pymethods]
 impl RasterState {
+    /// For every pixel the Gaussian at which half its light is gone, or −1: `[*lead, height, width]`.
+    fn median_ids<'py>(
+        &self,
+        py: Python<'py>,
+        lead: Vec<usize>,
+        width: usize,
+        height: usize,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let ids = run(py, || {
+            Ok(match &self.kept {
+                Kept::Single(state) => state.median_ids(),
+                Kept::Double(state) => state.median_ids(),
+            })
+        })?;
+        array(py, ids, &lead, &[height, width])
+    }
+
     /// Work done and skipped in the forward pass, summed over the views.
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counters = match &self.kept {

@@ -154,6 +154,13 @@ pub struct Counters {
 }
 
 impl<T: Real> BatchState<T> {
+    /// For every pixel of every view, the Gaussian at which half its light is gone; see
+    /// [`crate::Frame::median_ids`].
+    pub fn median_ids(&self) -> Vec<i32> {
+        let views: Vec<Vec<i32>> = self.views.par_iter().map(ViewState::median_ids).collect();
+        views.concat()
+    }
+
     /// Sums over the views.
     pub fn counters(&self) -> Counters {
         self.views.iter().fold(Counters::default(), |sum, view| Counters {
@@ -179,6 +186,7 @@ pub struct Wanted {
     pub means2d: bool,
     /// Leave what passes through `means2d` out of the other gradients, for a caller that sends it on.
     pub detach_means2d: bool,
+    pub absgrad: bool,
 }
 
 /// Gradients of a batch's inputs, each in the layout of its input; empty if not asked for. A shared input has the sum
@@ -196,6 +204,9 @@ pub struct BatchGradients<T> {
     pub backgrounds: Vec<T>,
     /// Of the centres on screen: views, Gaussians, x and y per pixel.
     pub means2d: Vec<T>,
+    /// Sums over pixels of the absolute values of what `means2d` sums, in its layout. With more than eight channels a
+    /// pixel's part is that of eight at a time.
+    pub absgrad: Vec<T>,
     /// Tiles of all views whose incoming gradient was zero.
     pub tiles_skipped: usize,
 }
@@ -418,6 +429,7 @@ impl<'a, T: Real> Batch<'a, T> {
         let mut viewmats = buffer(wanted.viewmats, 12);
         let mut backgrounds = buffer(wanted.backgrounds, self.shape.channels);
         let mut means2d = buffer(wanted.means2d, 2 * n);
+        let mut absgrad = buffer(wanted.absgrad, 2 * n);
         let geometry = (
             split(&mut means, views),
             split(&mut quats, views),
@@ -429,12 +441,16 @@ impl<'a, T: Real> Batch<'a, T> {
             split(&mut viewmats, views),
             split(&mut backgrounds, views),
             split(&mut means2d, views),
+            split(&mut absgrad, views),
         );
         let tiles_skipped = (geometry.into_par_iter(), rest.into_par_iter())
             .into_par_iter()
             .enumerate()
             .map(
-                |(view, ((means, quats, scales, opacities), (colors, viewmat, background, means2d)))| {
+                |(
+                    view,
+                    ((means, quats, scales, opacities), (colors, viewmat, background, means2d, absgrad)),
+                )| {
                     let v = Cotangents {
                         colors: &v_colors[view * pixels * total..][..pixels * total],
                         alphas: &v_alphas[view * pixels..][..pixels],
@@ -449,6 +465,7 @@ impl<'a, T: Real> Batch<'a, T> {
                         background,
                         means2d: rows_mut(means2d),
                         detach_means2d: wanted.detach_means2d,
+                        absgrad: rows_mut(absgrad),
                     };
                     let state = &state.views[view];
                     render_view_vjp(&self.view(view), self.mode, &self.limits, state, v, out)
@@ -468,6 +485,7 @@ impl<'a, T: Real> Batch<'a, T> {
                 None => backgrounds,
             },
             means2d,
+            absgrad,
             tiles_skipped,
         })
     }

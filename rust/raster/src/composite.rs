@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::dispatch::{self, SimdLevel};
 use crate::kernel::{
-    BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_SIDE, MOMENTS, TileCotangents, TileImage,
-    TilePlane, TileTask,
+    ABSOLUTES, BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_SIDE, MOMENTS, TileCotangents,
+    TileImage, TilePlane, TileTask,
 };
 use crate::project::Splat;
 use crate::real::Real;
@@ -276,6 +276,36 @@ fn write_tile<T: Real, const K: usize>(
     }
 }
 
+/// The Gaussian at which half of each pixel's light is gone, by rows and columns: the last of those that more than
+/// half reaches. −1 where nothing is seen.
+pub(crate) fn medians<T: Real>(scene: &Scene<'_, T>, canvas: &Canvas<T>) -> Vec<i32> {
+    let grid = &scene.grid;
+    let (level, blocks) = (SimdLevel::detect(), scene.blocks());
+    let mut ids = vec![-1; grid.width * grid.height];
+    let rows = grid.tile_size * grid.width;
+    ids.par_chunks_mut(rows).enumerate().for_each(|(row, ids)| {
+        let mut places = [Lanes::ZERO; MAX_BLOCKS];
+        for tile in row * grid.columns..(row + 1) * grid.columns {
+            let task = scene.task(tile);
+            if task.ranks.is_empty() {
+                continue;
+            }
+            let list = scene.bins.offsets[tile] as usize..scene.bins.offsets[tile + 1] as usize;
+            let end = &canvas.end[tile * blocks..(tile + 1) * blocks];
+            dispatch::median(level, &task, &canvas.masks[list], end, &mut places);
+            scene.for_block_rows(tile, |block, lane, pixel, count| {
+                let own = &mut ids[pixel - row * rows..][..count];
+                for (id, place) in own.iter_mut().zip(&places[block].0[lane..]) {
+                    if let Some(place) = place.past_ordinal().checked_sub(1) {
+                        *id = scene.ids[task.ranks[place as usize] as usize] as i32;
+                    }
+                }
+            });
+        }
+    });
+    ids
+}
+
 /// Gradients of an image.
 #[derive(Clone, Copy)]
 pub(crate) struct Cotangents<'a, T> {
@@ -286,7 +316,7 @@ pub(crate) struct Cotangents<'a, T> {
 
 /// What the compositor's vjp yields.
 pub(crate) struct CompositeGradients<T> {
-    /// `MOMENTS` + channels values per entry of `TileBins::ranks`.
+    /// `MOMENTS` + channels values per entry of `TileBins::ranks`, and `ABSOLUTES` if asked for.
     pub(crate) slots: Vec<T>,
     pub(crate) background: Vec<T>,
     /// Tiles whose incoming gradient was zero.
@@ -306,11 +336,12 @@ pub(crate) fn composite_vjp<T: Real>(
     scene: &Scene<'_, T>,
     canvas: &Canvas<T>,
     v: Cotangents<'_, T>,
+    absolute: bool,
 ) -> CompositeGradients<T> {
     let level = SimdLevel::detect();
     let blocks = scene.blocks();
     let total = scene.channels.total;
-    let stride = MOMENTS + total;
+    let stride = MOMENTS + total + if absolute { ABSOLUTES } else { 0 };
     let mut slots = vec![T::ZERO; scene.bins.ranks.len() * stride];
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
@@ -345,7 +376,7 @@ pub(crate) fn composite_vjp<T: Real>(
                         v_values: &incoming.v_values,
                         v_transmittance: &incoming.v_transmittance,
                     };
-                    dispatch::backward(level, &task, &cotangents, slots, stride);
+                    dispatch::backward(level, &task, &cotangents, slots, stride, absolute);
                 }
                 task.first += MAX_CHANNELS;
             }

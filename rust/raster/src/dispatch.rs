@@ -5,7 +5,8 @@
 use std::sync::OnceLock;
 
 use crate::kernel::{
-    MAX_BLOCKS, MAX_CHANNELS, TileCotangents, TileImage, TileTask, backward_tile, forward_tile,
+    Lanes, MAX_BLOCKS, MAX_CHANNELS, TileCotangents, TileImage, TilePlane, TileTask, backward_tile,
+    forward_tile, median_tile,
 };
 use crate::real::Real;
 #[cfg(target_arch = "x86_64")]
@@ -99,13 +100,23 @@ macro_rules! compiled_for {
             }
 
             #[target_feature(enable = $features)]
-            pub(super) fn backward<T: Real, const K: usize>(
+            pub(super) fn backward<T: Real, const K: usize, const ABSOLUTE: bool>(
                 task: &TileTask<'_, T>,
                 pixels: &TileCotangents<'_, T>,
                 slots: &mut [T],
                 stride: usize,
             ) {
-                backward_tile::<<T as Vectors>::$Vector, K>(task, pixels, slots, stride);
+                backward_tile::<<T as Vectors>::$Vector, K, ABSOLUTE>(task, pixels, slots, stride);
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn median<T: Real>(
+                task: &TileTask<'_, T>,
+                masks: &[u16],
+                end: &[Lanes<T>],
+                out: &mut TilePlane<T>,
+            ) {
+                median_tile::<<T as Vectors>::$Vector>(task, masks, end, out);
             }
         }
     };
@@ -138,7 +149,7 @@ fn forward_level<T: Real, const K: usize>(
 }
 
 #[allow(unsafe_code)]
-fn backward_level<T: Real, const K: usize>(
+fn backward_level<T: Real, const K: usize, const ABSOLUTE: bool>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
@@ -146,15 +157,15 @@ fn backward_level<T: Real, const K: usize>(
     stride: usize,
 ) {
     match level {
-        SimdLevel::Baseline => backward_tile::<T::Baseline, K>(task, pixels, slots, stride),
+        SimdLevel::Baseline => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, stride),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => backward_tile::<T::Baseline, K>(task, pixels, slots, stride),
+        SimdLevel::Neon => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, stride),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K>(task, pixels, slots, stride) },
+        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K, ABSOLUTE>(task, pixels, slots, stride) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K>(task, pixels, slots, stride) },
+        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K, ABSOLUTE>(task, pixels, slots, stride) },
     }
 }
 
@@ -174,19 +185,45 @@ pub(crate) fn forward<T: Real>(
     }
 }
 
-/// The vjp of [`forward`], written to `slots`.
+/// The vjp of [`forward`], written to `slots`; `absolute` says whether they have absolutes, for which there are fewer
+/// kernels.
 pub(crate) fn backward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
     slots: &mut [T],
     stride: usize,
+    absolute: bool,
 ) {
-    match task.channels.total - task.first {
-        1 => backward_level::<T, 1>(level, task, pixels, slots, stride),
-        2..=3 => backward_level::<T, 3>(level, task, pixels, slots, stride),
-        4 => backward_level::<T, 4>(level, task, pixels, slots, stride),
-        5..=6 => backward_level::<T, 6>(level, task, pixels, slots, stride),
-        _ => backward_level::<T, MAX_CHANNELS>(level, task, pixels, slots, stride),
+    match (task.channels.total - task.first, absolute) {
+        (1..=4, true) => backward_level::<T, 4, true>(level, task, pixels, slots, stride),
+        (_, true) => backward_level::<T, MAX_CHANNELS, true>(level, task, pixels, slots, stride),
+        (1, _) => backward_level::<T, 1, false>(level, task, pixels, slots, stride),
+        (2..=3, _) => backward_level::<T, 3, false>(level, task, pixels, slots, stride),
+        (4, _) => backward_level::<T, 4, false>(level, task, pixels, slots, stride),
+        (5..=6, _) => backward_level::<T, 6, false>(level, task, pixels, slots, stride),
+        _ => backward_level::<T, MAX_CHANNELS, false>(level, task, pixels, slots, stride),
+    }
+}
+
+/// The median splat of every pixel of a tile; see [`median_tile`].
+#[allow(unsafe_code)]
+pub(crate) fn median<T: Real>(
+    level: SimdLevel,
+    task: &TileTask<'_, T>,
+    masks: &[u16],
+    end: &[Lanes<T>],
+    out: &mut TilePlane<T>,
+) {
+    match level {
+        SimdLevel::Baseline => median_tile::<T::Baseline>(task, masks, end, out),
+        #[cfg(target_arch = "aarch64")]
+        SimdLevel::Neon => median_tile::<T::Baseline>(task, masks, end, out),
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe { avx2::median::<T>(task, masks, end, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe { avx512::median::<T>(task, masks, end, out) },
     }
 }

@@ -4,11 +4,11 @@ use rayon::prelude::*;
 
 use crate::camera::Camera;
 use crate::chunk::{CHUNK, ChunkGradients, ChunkSplats};
-use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp};
+use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp, medians};
 use crate::dispatch::SimdLevel;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
-use crate::kernel::{Channels, MOMENTS};
+use crate::kernel::{ABSOLUTES, Channels, MOMENTS};
 use crate::levels;
 use crate::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::project::{Lens, ScreenInfo, Splat};
@@ -134,6 +134,8 @@ impl<T: Real> Binned<T> {
 /// What the forward pass of a view keeps for the backward pass.
 #[derive(Debug)]
 pub(crate) struct ViewState<T: Real> {
+    grid: TileGrid,
+    limits: Limits<T>,
     binned: Pooled<Binned<T>>,
     canvas: Canvas<T>,
 }
@@ -141,6 +143,28 @@ pub(crate) struct ViewState<T: Real> {
 impl<T: Real> ViewState<T> {
     pub(crate) fn visible(&self) -> usize {
         self.binned.chunks().iter().map(|cover| cover.visible).sum()
+    }
+
+    /// See [`Frame::median_ids`].
+    pub(crate) fn median_ids(&self) -> Vec<i32> {
+        let scene = Scene {
+            grid: self.grid,
+            bins: &self.binned.bins,
+            splats: &self.binned.splats,
+            ids: self.binned.ids(),
+            // Only whom light reaches is asked, not with which colour.
+            channels: Channels {
+                colors: &[],
+                stride: 0,
+                total: 1,
+                colored: 0,
+            },
+            expected_depth: false,
+            background: None,
+            pixel_mask: None,
+            limits: &self.limits,
+        };
+        medians(&scene, &self.canvas)
     }
 
     pub(crate) fn culled(&self) -> usize {
@@ -173,6 +197,8 @@ pub(crate) struct ViewGradients<'a, T> {
     pub(crate) means2d: &'a mut [[T; 2]],
     /// Leave what passes through `means2d` out of the others.
     pub(crate) detach_means2d: bool,
+    /// Sums over pixels of the absolute values of the parts of `means2d`.
+    pub(crate) absgrad: &'a mut [[T; 2]],
 }
 
 fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
@@ -229,7 +255,12 @@ pub(crate) fn render_view<T: Real>(
     binned.project(view, limits, &grid, wanted.as_deref(), image.screen);
     binned.bin(&grid, &mut Pooled::take())?;
     let canvas = composite(&scene(view, mode, limits, &binned), image.colors, image.alphas);
-    Ok(ViewState { binned, canvas })
+    Ok(ViewState {
+        grid,
+        limits: *limits,
+        binned,
+        canvas,
+    })
 }
 
 /// Consecutive pieces of `values`, or `count` empty ones if there are no values.
@@ -241,23 +272,40 @@ fn pieces<U>(values: &mut [U], size: usize, count: usize) -> Vec<&mut [U]> {
     }
 }
 
-/// The slots of a view's vjp: `MOMENTS` + channels values per entry of [`TileBins::ranks`].
+/// The slots of a view's vjp: `MOMENTS` + channels values per entry of [`TileBins::ranks`], and absolutes if any.
 #[derive(Clone, Copy)]
 struct Slots<'a, T> {
     values: &'a [T],
     channels: Channels<'a, T>,
+    absolute: bool,
 }
 
 impl<T: Real> Slots<'_, T> {
+    fn size(&self) -> usize {
+        MOMENTS + self.channels.total + if self.absolute { ABSOLUTES } else { 0 }
+    }
+
+    /// Sums the absolutes of one Gaussian, tile by tile.
+    fn sum_absolutes(&self, positions: &[u32]) -> [T; ABSOLUTES] {
+        let mut sums = [T::ZERO; ABSOLUTES];
+        for &position in positions {
+            let slot = &self.values[position as usize * self.size()..][..self.size()];
+            for (sum, &v) in sums.iter_mut().zip(&slot[MOMENTS + self.channels.total..]) {
+                *sum += v;
+            }
+        }
+        sums
+    }
+
     /// Sums the slots of one Gaussian, tile by tile. Adds the gradients of its colours to `colors` (none if empty);
     /// returns the moments and the gradient of depth as a channel.
     #[inline(always)]
     fn sum(&self, positions: &[u32], colors: &mut [T]) -> [T; MOMENTS + 1] {
         const RGB: usize = MOMENTS + 3;
         let Channels { total, colored, .. } = self.channels;
-        let size = MOMENTS + total;
+        let size = self.size();
         let mut sums = [T::ZERO; MOMENTS + 1];
-        if total == 3 && colored == 3 {
+        if total == 3 && colored == 3 && !self.absolute {
             // The usual case in registers.
             let mut all = [T::ZERO; RGB];
             let slots = self.values.as_chunks::<RGB>().0;
@@ -306,7 +354,7 @@ pub(crate) fn render_view_vjp<T: Real>(
     out: ViewGradients<'_, T>,
 ) -> usize {
     let scene = scene(view, mode, limits, &state.binned);
-    let gradients = composite_vjp(&scene, &state.canvas, v);
+    let gradients = composite_vjp(&scene, &state.canvas, v, !out.absgrad.is_empty());
     for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
         *sum += v;
     }
@@ -314,6 +362,7 @@ pub(crate) fn render_view_vjp<T: Real>(
     let slots = Slots {
         values: &gradients.slots,
         channels: scene.channels,
+        absolute: !out.absgrad.is_empty(),
     };
     let (stride, colored) = (scene.channels.stride, scene.channels.colored);
     let camera = !out.viewmat.is_empty();
@@ -322,7 +371,11 @@ pub(crate) fn render_view_vjp<T: Real>(
             && out.quats.is_empty()
             && out.scales.is_empty()
             && out.opacities.is_empty());
-    if !geometry && out.means2d.is_empty() && (out.colors.is_empty() || colored == 0) {
+    if !geometry
+        && out.means2d.is_empty()
+        && out.absgrad.is_empty()
+        && (out.colors.is_empty() || colored == 0)
+    {
         return gradients.tiles_skipped;
     }
     let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
@@ -336,12 +389,13 @@ pub(crate) fn render_view_vjp<T: Real>(
         pieces(out.opacities, CHUNK, count),
         pieces(out.colors, CHUNK * stride.max(1), count),
         pieces(out.means2d, CHUNK, count),
+        pieces(out.absgrad, CHUNK, count),
         covers,
     )
         .into_par_iter()
         .enumerate()
         .map(
-            |(chunk, (means, quats, scales, opacities, colors, means2d, cover))| {
+            |(chunk, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
                 let mut v = ChunkGradients::new();
                 for local in 0..cover.len() {
                     let own = &positions[cover.pairs_of(local)];
@@ -354,8 +408,14 @@ pub(crate) fn render_view_vjp<T: Real>(
                         &mut colors[local * stride..][..colored]
                     };
                     let mut sums = slots.sum(own, v_colors);
+                    let splat = &state.binned.splats[chunk * CHUNK + local];
+                    if let Some(v) = absgrad.get_mut(local) {
+                        let gain = T::of(2.0 * std::f64::consts::LN_2) * splat.opacity;
+                        let [x, y] = slots.sum_absolutes(own);
+                        *v = [gain * splat.w11 * x, gain * y];
+                    }
                     if let Some(v) = means2d.get_mut(local) {
-                        *v = centre_vjp(&state.binned.splats[chunk * CHUNK + local], [sums[1], sums[2]]);
+                        *v = centre_vjp(splat, [sums[1], sums[2]]);
                         if out.detach_means2d {
                             sums[1..3].fill(T::ZERO);
                         }
@@ -396,6 +456,16 @@ pub struct Frame<T: Real> {
     state: ViewState<T>,
 }
 
+impl<T: Real> Frame<T> {
+    /// The Gaussian at which half of each pixel's light is gone, by rows and columns: the last of those that more than
+    /// half reaches, as in 2D Gaussian splatting. −1 where nothing is seen. Its depth is the pixel's median depth, and
+    /// has the gradient of that.
+    #[must_use]
+    pub fn median_ids(&self) -> Vec<i32> {
+        self.state.median_ids()
+    }
+}
+
 /// Gradients of all inputs of a view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GaussianGrads<T> {
@@ -415,6 +485,8 @@ pub struct GaussianGrads<T> {
     pub background: Vec<T>,
     /// Of the centres on screen, per pixel: what densification strategies watch. Already contained in the others.
     pub means2d: Vec<[T; 2]>,
+    /// Sums over pixels of the absolute values of what `means2d` sums; empty unless [`Renderer::with_absgrad`].
+    pub absgrad: Vec<[T; 2]>,
 }
 
 /// Renders single views.
@@ -422,6 +494,7 @@ pub struct GaussianGrads<T> {
 pub struct Renderer<T> {
     limits: Limits<T>,
     mode: RenderMode,
+    absgrad: bool,
 }
 
 impl<T: Real> Renderer<T> {
@@ -433,7 +506,18 @@ impl<T: Real> Renderer<T> {
         Ok(Self {
             limits: Limits::new(settings)?,
             mode,
+            absgrad: false,
         })
+    }
+
+    /// The same renderer, whose gradients hold absolute ones on screen as well, which some densification strategies
+    /// (AbsGS) read. With more than eight channels a pixel's part is that of eight at a time.
+    #[must_use]
+    pub fn with_absgrad(self) -> Self {
+        Self {
+            absgrad: true,
+            ..self
+        }
     }
 
     /// Renders Gaussians; `background` has one value per colour channel (black if absent).
@@ -513,6 +597,7 @@ impl<T: Real> Renderer<T> {
             viewmat: [[T::ZERO; 4]; 3],
             background: vec![T::ZERO; gaussians.channels],
             means2d: vec![[T::ZERO; 2]; n],
+            absgrad: vec![[T::ZERO; 2]; if self.absgrad { n } else { 0 }],
         };
         let out = ViewGradients {
             means: &mut grads.means,
@@ -524,6 +609,7 @@ impl<T: Real> Renderer<T> {
             background: &mut grads.background,
             means2d: &mut grads.means2d,
             detach_means2d: false,
+            absgrad: &mut grads.absgrad,
         };
         let v = Cotangents {
             colors: v_colors,

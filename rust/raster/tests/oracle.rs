@@ -270,3 +270,60 @@ fn gradients_on_screen_are_those_of_moving_the_image() {
         assert!(expected.abs() > 1e-3);
     }
 }
+
+#[test]
+fn absolute_gradients_are_those_of_single_pixels() {
+    let (width, height) = (13, 11);
+    let scene = Scene::<f64>::random(30, 3, 41);
+    let camera = camera(VIEWMAT, width, height);
+    let renderer = Renderer::<f64>::new(&RasterSettings::default(), RenderMode::Rgb)
+        .unwrap()
+        .with_absgrad();
+    let frame = renderer.render(&scene.view(), &camera, None).unwrap();
+    let mut r = Random::new(5);
+    let v_colors: Vec<f64> = (0..width * height * 3).map(|_| r.uniform(-1.0, 1.0)).collect();
+    let v_alphas = vec![0.0; width * height];
+    let gradients = |v_colors: &[f64]| {
+        renderer
+            .render_vjp(&scene.view(), &camera, None, &frame, v_colors, &v_alphas)
+            .unwrap()
+    };
+    let mut sums = vec![0.0; 2 * 30];
+    for pixel in 0..width * height {
+        let mut alone = vec![0.0; v_colors.len()];
+        alone[3 * pixel..3 * pixel + 3].copy_from_slice(&v_colors[3 * pixel..3 * pixel + 3]);
+        let grads = gradients(&alone);
+        for (sum, v) in sums.iter_mut().zip(grads.means2d.as_flattened()) {
+            *sum += v.abs();
+        }
+    }
+    let together = gradients(&v_colors);
+    assert!(relative(together.absgrad.as_flattened(), &sums) < 1e-12);
+    let plain = Renderer::<f64>::new(&RasterSettings::default(), RenderMode::Rgb).unwrap();
+    let without = plain
+        .render_vjp(&scene.view(), &camera, None, &frame, &v_colors, &v_alphas)
+        .unwrap();
+    assert!(without.absgrad.is_empty());
+    assert!(relative(together.means.as_flattened(), without.means.as_flattened()) < 1e-12);
+}
+
+#[test]
+fn the_median_is_where_half_the_light_is_gone() {
+    // Three walls; before each of them there is light 1, 0.6, 0.42.
+    let mut scene = Scene::<f32>::random(3, 3, 1);
+    scene.means = vec![[0.0, 0.0, 3.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]];
+    scene.scales = vec![[1e3; 3]; 3];
+    let medians = |opacities: [f32; 3]| {
+        let mut scene = scene.clone();
+        scene.opacities = opacities.to_vec();
+        let identity = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
+        let renderer = Renderer::new(&RasterSettings::default(), RenderMode::Rgb).unwrap();
+        let frame = renderer
+            .render(&scene.view(), &camera(identity, 9, 7), None)
+            .unwrap();
+        frame.median_ids()
+    };
+    assert_eq!(medians([0.9, 0.4, 0.3]), [2; 63]);
+    assert_eq!(medians([0.9, 0.4, 0.1]), [0; 63]);
+    assert_eq!(medians([0.0, 0.0, 0.0]), [-1; 63]);
+}

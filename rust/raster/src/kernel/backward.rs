@@ -1,7 +1,8 @@
 //! One tile, back to front, gradients.
 
 use super::{
-    Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane, TileTask, WORD, falloff,
+    ABSOLUTES, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane, TileTask,
+    WORD, falloff,
 };
 use crate::real::Real;
 use crate::vector::Vector;
@@ -34,6 +35,7 @@ struct Block<T, const K: usize> {
 struct Sums<V, const K: usize> {
     moments: [V; MOMENTS],
     v_values: [V; K],
+    absolutes: [V; ABSOLUTES],
 }
 
 /// The rules of a render in vectors.
@@ -45,7 +47,7 @@ struct Rules<V> {
 
 impl<V: Vector, const K: usize> Sums<V, K> {
     #[inline(always)]
-    fn add(
+    fn add<const ABSOLUTE: bool>(
         &mut self,
         entry: &Entry<V::Scalar, K>,
         block: &mut Block<V::Scalar, K>,
@@ -85,13 +87,21 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         for k in 0..K {
             self.v_values[k] = weight.times_plus(block.v_values[k].get(lane), self.v_values[k]);
         }
+        if ABSOLUTE {
+            let zero = V::splat(V::Scalar::ZERO);
+            let absolute = |x: V| x.max(zero.minus(x));
+            let along_y = V::splat(entry.w12).times_plus(hu, V::splat(entry.w22).times(hv));
+            let [x, y] = self.absolutes;
+            self.absolutes = [x.plus(absolute(hu)), y.plus(absolute(along_y))];
+        }
     }
 }
 
 /// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`stride` values
-/// each: the moments, then all channels). Channels after the first group add to the moments.
+/// each: the moments, then all channels, then the absolutes if ABSOLUTE). Channels after the first group add to the
+/// moments and the absolutes.
 #[inline(always)]
-pub(crate) fn backward_tile<V: Vector, const K: usize>(
+pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
     slots: &mut [V::Scalar],
@@ -165,10 +175,12 @@ pub(crate) fn backward_tile<V: Vector, const K: usize>(
             let mut rest = mask & active;
             let slot = &mut slots[(batch + i) * stride..][..stride];
             let (moments, v_values) = slot.split_at_mut(MOMENTS);
+            let (v_values, absolutes) = v_values.split_at_mut(task.channels.total);
             let v_values = &mut v_values[task.first..][..used];
             if rest == 0 {
                 if task.first == 0 {
                     moments.fill(zero);
+                    absolutes.fill(zero);
                 }
                 v_values.fill(zero);
                 continue;
@@ -177,12 +189,13 @@ pub(crate) fn backward_tile<V: Vector, const K: usize>(
             let mut sums = Sums::<V, K> {
                 moments: [V::splat(zero); MOMENTS],
                 v_values: [V::splat(zero); K],
+                absolutes: [V::splat(zero); ABSOLUTES],
             };
             while rest != 0 {
                 let block = rest.trailing_zeros() as usize;
                 rest &= rest - 1;
                 for lane in (0..LANES).step_by(V::LANES) {
-                    sums.add(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
+                    sums.add::<ABSOLUTE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
                 }
             }
             let m = V::sums(&sums.moments);
@@ -195,6 +208,12 @@ pub(crate) fn backward_tile<V: Vector, const K: usize>(
                 }
             }
             v_values.copy_from_slice(&c[..used]);
+            if ABSOLUTE {
+                let a = V::sums(&sums.absolutes);
+                for (sum, a) in absolutes.iter_mut().zip(a) {
+                    *sum = if task.first == 0 { a } else { *sum + a };
+                }
+            }
         }
     }
 }

@@ -9,12 +9,14 @@
 
 mod backward;
 mod forward;
+mod median;
 mod reach;
 #[cfg(test)]
 mod tests;
 
 pub(crate) use backward::{TileCotangents, backward_tile};
 pub(crate) use forward::{TileImage, forward_tile};
+pub(crate) use median::median_tile;
 
 use crate::project::Splat;
 use crate::real::Real;
@@ -31,6 +33,8 @@ pub(crate) const MAX_SIDE: usize = 16;
 pub(crate) const MAX_BLOCKS: usize = 16;
 /// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv.
 pub(crate) const MOMENTS: usize = 6;
+/// Gradient values after those of the channels where they are asked for: Σ |h u|, and Σ |h (w12 u + w22 v)|.
+pub(crate) const ABSOLUTES: usize = 2;
 /// Most channels composited at once.
 pub(crate) const MAX_CHANNELS: usize = 8;
 /// Splats whose block masks make a word per block.

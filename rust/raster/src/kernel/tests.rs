@@ -113,9 +113,9 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
             v_transmittance: &v_transmittance,
         };
         match runner {
-            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, stride),
+            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, stride, false),
             Runner::Portable => {
-                backward_tile::<T::Vector, MAX_CHANNELS>(&task, &cotangents, &mut slots, stride);
+                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, stride);
             }
         }
         task.first += MAX_CHANNELS;
