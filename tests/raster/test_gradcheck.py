@@ -49,14 +49,16 @@ def test_depth_modes(mode):
     check(inputs, ["means", "opacities", "scales"], settings=SMOOTH, render_mode=mode)
 
 
-def test_antialiased_opacity():
+@pytest.mark.parametrize("camera_model", ["pinhole", "ortho"])
+@pytest.mark.parametrize("size", [0.02, 0.2, 1.0])
+def test_antialiased_opacity(size, camera_model):
+    """From far below a pixel, where compensation is all there is, to well above."""
     settings = RasterSettings(alpha_threshold=0.0, min_transmittance=0.0, antialiased=True)
     inputs = scene(n=5, width=8, height=6)
-    check(
-        {**inputs, "scales": 0.2 * inputs["scales"]},
-        ["means", "quats", "scales", "opacities"],
-        settings=settings,
-    )
+    if camera_model == "ortho":
+        inputs = without_perspective(inputs)
+    inputs["scales"] *= size
+    check(inputs, ["means", "quats", "scales", "opacities"], settings=settings)
 
 
 def test_shared_and_per_frame_inputs():

@@ -1,12 +1,9 @@
 """The engine against its slow torch twin, which shares no code with it."""
 
-import dataclasses
-
 import pytest
 import torch
 from raster_scenes import gradients, relative, scene, without_perspective
 
-from bigs.checks import InputError
 from bigs.raster import RasterSettings, rasterization
 
 TOLERANCE = {torch.float64: (1e-12, 1e-10), torch.float32: (2e-6, 2e-4)}
@@ -75,10 +72,12 @@ def test_no_background():
     compare({**scene(n=50), "backgrounds": None})
 
 
-def test_antialiased():
-    inputs = scene(n=120)
-    inputs["scales"] = inputs["scales"] * torch.tensor([1.0, 0.3, 0.01])
-    compare(inputs, settings=RasterSettings(antialiased=True))
+# A faint image is 1 - T with T next to 1: single precision has few digits left of it.
+@pytest.mark.parametrize(("size", "dtype"), [(1.0, torch.float32), (1.0, torch.float64), (0.02, torch.float64)])
+def test_antialiased(size, dtype):
+    inputs = scene(n=120, dtype=dtype)
+    inputs["scales"] = inputs["scales"] * size * torch.tensor([1.0, 0.3, 0.01], dtype=dtype)
+    compare(inputs, settings=RasterSettings(antialiased=True, alpha_threshold=1e-4))
 
 
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
@@ -129,49 +128,3 @@ def test_info_agrees():
     for name in ("means2d", "depths"):
         assert relative(fast[name], slow[name]) < 1e-12
     assert fast["n_visible"] == (slow["depths"] > 0).sum()
-
-
-def test_gsplat_is_named_when_missing():
-    with pytest.raises(InputError, match="pip install gsplat"):
-        rasterization(**scene(), backend="gsplat")
-
-
-class FakeGsplat:
-    """Stands in for the CUDA library: same call, rendered by the twin."""
-
-    def rasterization(self, *, rasterize_mode, packed, **call):
-        assert not packed
-        rules = ("near_plane", "far_plane", "radius_clip", "eps2d", "tile_size")
-        settings = RasterSettings(
-            **{name: call.pop(name) for name in rules},
-            antialiased=rasterize_mode == "antialiased",
-        )
-        return rasterization(**call, settings=settings, backend="torch")
-
-
-def test_gsplat_receives_the_call(monkeypatch):
-    monkeypatch.setattr("bigs.raster.cuda._gsplat", FakeGsplat)
-    inputs = without_perspective(scene(n=30, batch=(2,)))
-    inputs["colors"] = torch.rand(30, 9, 3, generator=torch.Generator().manual_seed(2)).double()
-    inputs["sh_degree"] = 2
-    mask = torch.rand(2, 1, 18, 23) < 0.5
-    settings = RasterSettings(antialiased=True, radius_clip=2.0)
-    call = {**inputs, "pixel_mask": mask, "settings": settings, "render_mode": "RGB+D"}
-    through, direct = (rasterization(**call, backend=backend) for backend in ("gsplat", "rust"))
-    assert relative(through.colors, direct.colors) < 1e-12
-    assert relative(through.alphas, direct.alphas) < 1e-12
-    with pytest.raises(InputError, match=r"settings\.max_alpha"):
-        rasterization(**inputs, settings=dataclasses.replace(settings, max_alpha=0.99), backend="gsplat")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_agrees_with_rust():
-    pytest.importorskip("gsplat")
-    inputs = scene(n=200, dtype=torch.float32)
-    device = {k: v.cuda() if isinstance(v, torch.Tensor) else v for k, v in inputs.items()}
-    _, _, fast = gradients(inputs)
-    colors, _, grads = gradients(device)
-    assert relative(colors.cpu(), rasterization(**inputs).colors) < 1e-5
-    for name in fast:
-        if name != "viewmats":
-            assert relative(grads[name].cpu(), fast[name]) < 1e-3

@@ -43,6 +43,15 @@
 //! are those of the formulas: a pair of pixel and Gaussian that is clamped, below the alpha threshold or behind the
 //! point where a pixel stops passes none. `examples/fit_image.rs` is a whole optimisation.
 //!
+//! `means2d` are the gradients of the centres on screen that densification strategies read, already contained in the
+//! others; [`Renderer::with_absgrad`] adds their absolute form.
+//!
+//! # Beyond plain colours and pinholes
+//!
+//! [`Harmonics`] turns spherical harmonics into the colours that a camera sees, and back for gradients.
+//! [`Camera::with_model`] makes a camera orthographic. [`Frame::median_ids`] names the Gaussian at each pixel's median
+//! depth. [`RasterSettings::antialiased`] keeps thin Gaussians from growing brighter.
+//!
 //! # Many views
 //!
 //! [`Batch`] renders entries × cameras at once. An input may be shared along either axis ([`Slabs`]): its gradient is
