@@ -56,7 +56,8 @@ def rasterization(
         means: centres in the world, metres.
         quats: rotations w x y z, of any length; the zero quaternion is no rotation.
         scales: standard deviations along the rotated axes, metres.
-        opacities: in [0, 1].
+        opacities: in [0, 1]; above 1 a Gaussian is opaque further out (alpha is limited, as in gsplat), below 0
+            it is not there.
         colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too. With `sh_degree` the
             coefficients of spherical harmonics, and D is 3.
         viewmats: world to camera, OpenCV axes; the 3×3 part must be invertible.
@@ -270,6 +271,8 @@ def _check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
     check_finite("Ks", Ks)
     views, matrices = (x.detach().cpu().numpy().astype(np.float64) for x in (viewmats, Ks))
     rotations = views[..., :3, :3]
+    # In units of each row's largest entry, so that no product leaves the range of numbers.
+    rotations = rotations / np.abs(rotations).max(-1, keepdims=True).clip(min=np.finfo(np.float32).tiny)
     volume = np.prod(np.linalg.norm(rotations, axis=-1), axis=-1)
     problems = (
         ("viewmats", "0 0 0 1 as the last row", (views[..., 3, :] != [0, 0, 0, 1]).any(-1)),

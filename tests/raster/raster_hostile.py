@@ -153,7 +153,7 @@ def far_from_origin(offset: float, turned: bool) -> Callable[[], dict[str, Any]]
 
 
 def camera_matrix(linear: list[list[float]], grow: float = 1.0) -> Callable[[], dict[str, Any]]:
-    """The base scene seen through a camera whose 3×3 part is no rotation; means and scales are multiplied by `grow`."""
+    """The base scene, `grow` times as large, seen through a camera whose 3×3 part is no rotation."""
 
     def build() -> dict[str, Any]:
         inputs = base()

@@ -1,7 +1,7 @@
 """A float64 renderer that stays exact where `bigs.raster.reference` does not: needles, huge and tiny numbers.
 
-No tiles and no culling: every pixel against every Gaussian, gradients by autograd. It never subtracts the products of a
-determinant from each other, and `exact_whitening` repeats its one delicate step with 60 digits.
+No tiles, no culling: every pixel meets every Gaussian, gradients are autograd's. No determinant is taken as
+ac − b², and `exact_whitening` repeats this one delicate step with 60 digits.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def exact_whitening(rows: torch.Tensor, eps2d: float) -> torch.Tensor:
 def render(
     inputs: dict[str, Any], settings: RasterSettings | None = None, depth: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Colors [1, H, W, D] (and depth as the last channel if asked for) and alphas [1, H, W, 1] of one view."""
+    """Colors [1, H, W, D], depth as the last channel if asked for, and alphas [1, H, W, 1] of one view."""
     settings = settings or RasterSettings()
     width, height = inputs["width"], inputs["height"]
     screen = footprints(inputs, settings)

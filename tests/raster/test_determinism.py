@@ -13,13 +13,22 @@ import hashlib, sys
 sys.path.insert(0, sys.argv[1])
 import torch
 from raster_scenes import gradients, scene
-inputs = scene(n=3000, channels=4, batch=(5,), cameras=2, width=120, height=90, dtype=torch.float32)
-for name in ("scales", "opacities", "colors", "backgrounds"):
-    inputs[name] = inputs[name][0]
-colors, alphas, grads = gradients(inputs, render_mode="RGB+D")
 digest = hashlib.sha256()
-for tensor in (colors, alphas, *grads.values()):
-    digest.update(tensor.numpy().tobytes())
+# Few and many channels, shared and own inputs, several entries and cameras, with and without a mask.
+for channels, batch, cameras, mode, dtype in (
+    (4, (5,), 2, "RGB+D", torch.float32),
+    (11, (), 1, "RGB+ED", torch.float32),
+    (3, (2,), 3, "RGB", torch.float64),
+):
+    inputs = scene(1500, channels, cameras, batch, width=100, height=70, dtype=dtype)
+    if batch:
+        for name in ("scales", "opacities", "colors", "backgrounds"):
+            inputs[name] = inputs[name][0]
+    mask = torch.rand(*batch, cameras, 70, 100, generator=torch.Generator().manual_seed(1)) < 0.7
+    for options in ({}, {"pixel_mask": mask}):
+        colors, alphas, grads = gradients({**inputs, **options}, render_mode=mode)
+        for tensor in (colors, alphas, *grads.values()):
+            digest.update(tensor.numpy().tobytes())
 print(digest.hexdigest())
 """
 
@@ -32,8 +41,9 @@ def digest(threads: int) -> str:
 
 def test_thread_counts():
     single = digest(1)
-    assert digest(2) == single
-    assert digest(3) == single
+    assert len(single) == 65
+    for threads in (2, 3, 8):
+        assert digest(threads) == single, f"{threads} threads"
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -27,7 +27,7 @@ def truth(name: str) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor
 
 
 def errors(name: str, dtype: torch.dtype, inputs: dict[str, Any] | None = None) -> tuple[float, float]:
-    """Relative L2 error of the image, and the largest of the gradients: over all, and over the hostile ones alone."""
+    """Relative L2 error of the image, and the largest of the gradients (also of the hostile ones alone)."""
     given = {
         k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in (inputs or scene_of(name)).items()
     }
@@ -43,7 +43,7 @@ def errors(name: str, dtype: torch.dtype, inputs: dict[str, Any] | None = None) 
 
 
 def moved_by_half_a_bit(name: str) -> tuple[float, float]:
-    """How far the truth itself goes when every input moves by half a bit of single precision: the larger of two tries."""
+    """How far the truth goes when the inputs move by half a bit of float32; the worse of two tries."""
     generator = torch.Generator().manual_seed(1)
     true_colors, true_alphas, true_grads = truth(name)
     worst = [0.0, 0.0]

@@ -3,6 +3,11 @@
 use crate::error::RasterError;
 use crate::real::Real;
 
+/// Pixels along a side at most: further out `f32` no longer resolves the hundredth of a pixel that culling allows for.
+const MAX_SIDE: usize = 1 << 16;
+/// Pixels at most: what sizes are multiplied by later stays far from the end of the integers.
+const MAX_PIXELS: usize = 1 << 28;
+
 /// How a camera maps a point (X, Y, Z) of its own frame to the image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CameraModel {
@@ -55,7 +60,7 @@ impl<T: Real> Camera<T> {
     ///
     /// # Errors
     /// A matrix that is not finite, is singular or whose last row is not 0 0 0 1, a focal length that is not
-    /// positive, or an empty image.
+    /// positive, an empty image, or one of more than 65,536 pixels a side or 2^28 in all.
     pub fn new(
         viewmat: [[T; 4]; 4],
         k: Intrinsics<T>,
@@ -76,8 +81,12 @@ impl<T: Real> Camera<T> {
             return bad("expected 0 0 0 1 as the last row of the world-to-camera matrix");
         }
         let rotation = [0, 1, 2].map(|i| [viewmat[i][0], viewmat[i][1], viewmat[i][2]]);
-        // Relative to the lengths of the rows, so that a scaled world does not look singular.
-        let rows = rotation.map(|r| r.map(Real::as_f64));
+        // Relative to the lengths of the rows, so that a scaled world does not look singular; measured in units of each
+        // row's largest entry, so that no product leaves the range of numbers.
+        let rows = rotation.map(|r| {
+            let largest = r.iter().fold(T::TINY, |largest, v| largest.greater(v.abs()));
+            r.map(|v| (v / largest).as_f64())
+        });
         let volume = rows[0][0] * (rows[1][1] * rows[2][2] - rows[1][2] * rows[2][1])
             - rows[0][1] * (rows[1][0] * rows[2][2] - rows[1][2] * rows[2][0])
             + rows[0][2] * (rows[1][0] * rows[2][1] - rows[1][1] * rows[2][0]);
@@ -93,6 +102,9 @@ impl<T: Real> Camera<T> {
         }
         if width == 0 || height == 0 {
             return bad("expected an image of at least one pixel");
+        }
+        if width > MAX_SIDE || height > MAX_SIDE || width * height > MAX_PIXELS {
+            return bad("expected an image of at most 65536 pixels a side and 2^28 in all");
         }
         Ok(Self {
             rotation,

@@ -5,7 +5,7 @@
 //! chunks do not depend on the number of threads.
 
 use crate::gaussians::Gaussians;
-use crate::project::{Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
+use crate::project::{GaussianGradient, Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
 use crate::real::Real;
 use crate::tiles::{Cover, Cutter, Ellipse, TileGrid, padded_reach, pixel_range};
 
@@ -239,7 +239,18 @@ fn add<T: Real, const N: usize>(locals: &[u32], columns: [&Column<T>; N], sums: 
     }
 }
 
-/// The vjp of [`project_chunk`], from splats to Gaussians and camera.
+/// Whether all are finite: NaN and infinity survive a multiplication by 0.
+#[inline(always)]
+pub(crate) fn is_sound<T: Real, const N: usize>(values: [T; N]) -> bool {
+    let mut sum = T::ZERO;
+    for value in values {
+        sum += value * T::ZERO;
+    }
+    sum == T::ZERO
+}
+
+/// The vjp of [`project_chunk`], from splats to Gaussians and camera. A Gaussian whose gradient is beyond the scalar's
+/// range has none: one that stands on the camera must not spoil the camera's gradient, nor an optimiser's averages.
 #[inline(always)]
 pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
     gaussians: &Gaussians<'_, T>,
@@ -264,7 +275,11 @@ pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
             second: [huu, huv, hvv],
             depth,
         };
-        let v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
+        let mut v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
+        // NaN that came in stays, so that it is noticed.
+        if !is_sound(v.values()) & is_sound(chunk.moments.map(|column| column[lane])) {
+            v = GaussianGradient::default();
+        }
         [out[0][lane], out[1][lane], out[2][lane]] = v.mean;
         [out[3][lane], out[4][lane], out[5][lane], out[6][lane]] = v.quat;
         [out[7][lane], out[8][lane], out[9][lane]] = v.scale;

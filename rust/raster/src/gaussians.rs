@@ -22,7 +22,8 @@ impl<'a, T: Real> Gaussians<'a, T> {
     /// * `means`: centres in the world
     /// * `quats`: rotations, w x y z, of any length; the zero quaternion is taken as no rotation
     /// * `scales`: standard deviations along the rotated axes
-    /// * `opacities`: in [0, 1]
+    /// * `opacities`: in [0, 1]; above 1 they are opaque further out from the centre (alpha is limited, as in gsplat), and
+    ///   a Gaussian below 0 is not there
     /// * `colors`: `channels` values per Gaussian
     ///
     /// # Errors

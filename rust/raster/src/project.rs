@@ -13,6 +13,9 @@ use crate::settings::Limits;
 /// far outside the view the linearisation would blow a Gaussian up across the whole image.
 const FRUSTUM_MARGIN: f64 = 0.3 * 0.5;
 
+/// Standard deviations between the image's corner and a centre at which numbers are about to end.
+const UNREACHABLE: f64 = 1e30;
+
 /// A Gaussian on the screen.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Splat<T> {
@@ -185,7 +188,9 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     let extent = extent(reach);
     let [rx, ry] = w.deviations.map(|deviation| extent * deviation);
     // Comparisons are written so that NaN, which finite inputs can still overflow to, is culled too.
-    let in_range = (depth > limits.near) & (depth < limits.far) & w.sound & x.is_finite() & y.is_finite();
+    // So far away that u and v overflow, it is as good as behind the camera; only reached without an alpha threshold.
+    let distance = (w.w11 * x).abs() + (w.w12 * y).abs() + (w.w22 * y).abs();
+    let in_range = (depth > limits.near) & (depth < limits.far) & w.sound & (distance < T::of(UNREACHABLE));
     let [width, height] = lens.size;
     let on_screen = (x + rx > T::ZERO) & (x - rx < width) & (y + ry > T::ZERO) & (y - ry < height);
     // Radius 0 is a Gaussian that reaches the threshold only at its very centre.
@@ -223,12 +228,47 @@ pub(crate) struct SplatGradient<T> {
 }
 
 /// Gradients of one view for one Gaussian; the last is that of the world-to-camera matrix, rows of [R | t].
+#[derive(Clone, Copy, Default)]
 pub(crate) struct GaussianGradient<T> {
     pub(crate) mean: Vec3<T>,
     pub(crate) quat: [T; 4],
     pub(crate) scale: Vec3<T>,
     pub(crate) opacity: T,
     pub(crate) viewmat: [[T; 4]; 3],
+}
+
+impl<T: Real> GaussianGradient<T> {
+    /// All of them.
+    #[inline(always)]
+    pub(crate) fn values(&self) -> [T; 23] {
+        let ([m0, m1, m2], [q0, q1, q2, q3], [s0, s1, s2]) = (self.mean, self.quat, self.scale);
+        let [[v0, v1, v2, v3], [v4, v5, v6, v7], [v8, v9, v10, v11]] = self.viewmat;
+        [
+            m0,
+            m1,
+            m2,
+            q0,
+            q1,
+            q2,
+            q3,
+            s0,
+            s1,
+            s2,
+            self.opacity,
+            v0,
+            v1,
+            v2,
+            v3,
+            v4,
+            v5,
+            v6,
+            v7,
+            v8,
+            v9,
+            v10,
+            v11,
+        ]
+    }
 }
 
 /// The vjp of [`splat`] for a visible Gaussian.

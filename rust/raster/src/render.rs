@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::camera::Camera;
-use crate::chunk::{CHUNK, ChunkGradients, ChunkSplats};
+use crate::chunk::{CHUNK, ChunkGradients, ChunkSplats, is_sound};
 use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp, medians};
 use crate::dispatch::SimdLevel;
 use crate::error::RasterError;
@@ -337,11 +337,24 @@ impl<T: Real> Slots<'_, T> {
     }
 }
 
+/// A gradient, or none if it is beyond the scalar's range, as in [`crate::chunk::vjp_chunk`]; `from` is what it was made of.
+#[inline(always)]
+fn kept<T: Real>(gradient: [T; 2], from: [T; 2]) -> [T; 2] {
+    if !is_sound(gradient) & is_sound(from) {
+        [T::ZERO; 2]
+    } else {
+        gradient
+    }
+}
+
 /// Gradient of a splat's centre in pixels, from its first moments Σ h u and Σ h v.
 #[inline(always)]
 fn centre_vjp<T: Real>(splat: &Splat<T>, [u, v]: [T; 2]) -> [T; 2] {
     let gain = T::of(2.0 * std::f64::consts::LN_2) * splat.opacity;
-    [gain * splat.w11 * u, gain * (splat.w12 * u + splat.w22 * v)]
+    kept(
+        [gain * splat.w11 * u, gain * (splat.w12 * u + splat.w22 * v)],
+        [u, v],
+    )
 }
 
 /// The vjp of [`render_view`]; returns how many tiles had no incoming gradient. Gradients are added.
@@ -412,7 +425,7 @@ pub(crate) fn render_view_vjp<T: Real>(
                     if let Some(v) = absgrad.get_mut(local) {
                         let gain = T::of(2.0 * std::f64::consts::LN_2) * splat.opacity;
                         let [x, y] = slots.sum_absolutes(own);
-                        *v = [gain * splat.w11 * x, gain * y];
+                        *v = kept([gain * splat.w11 * x, gain * y], [x, y]);
                     }
                     if let Some(v) = means2d.get_mut(local) {
                         *v = centre_vjp(splat, [sums[1], sums[2]]);
