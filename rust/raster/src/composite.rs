@@ -315,6 +315,7 @@ pub(crate) struct Cotangents<'a, T> {
 }
 
 /// What the compositor's vjp yields.
+#[derive(Debug)]
 pub(crate) struct CompositeGradients<T> {
     /// `MOMENTS` + channels values per entry of `TileBins::ranks`, and `ABSOLUTES` if asked for.
     pub(crate) slots: Vec<T>,

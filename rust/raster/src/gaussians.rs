@@ -75,13 +75,20 @@ pub(crate) fn check_length(name: &'static str, expected: usize, got: usize) -> R
 }
 
 pub(crate) fn check_finite<T: Real>(name: &'static str, values: &[T]) -> Result<(), RasterError> {
+    match T::first_not_finite(values) {
+        Some(index) => Err(RasterError::NotFinite { name, index }),
+        None => Ok(()),
+    }
+}
+
+/// Where the first NaN or infinity is.
+pub(crate) fn first_not_finite<T: Real>(values: &[T]) -> Option<usize> {
     // Counting vectorises, a search that may stop early does not.
     let finite = values
         .par_chunks(1 << 14)
         .all(|chunk| chunk.iter().filter(|v| !v.is_finite()).count() == 0);
     if finite {
-        return Ok(());
+        return None;
     }
-    let index = values.iter().position(|v| !v.is_finite()).unwrap_or(0);
-    Err(RasterError::NotFinite { name, index })
+    values.iter().position(|v| !v.is_finite())
 }

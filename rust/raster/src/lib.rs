@@ -92,6 +92,7 @@
 mod batch;
 mod camera;
 mod chunk;
+mod compiled;
 mod composite;
 mod cov;
 mod dispatch;

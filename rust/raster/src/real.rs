@@ -4,6 +4,7 @@ use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub};
 
+use crate::compiled::Compiled;
 use crate::sort::RadixKey;
 use crate::vector::Vectors;
 
@@ -24,6 +25,7 @@ pub trait Real:
     + Neg<Output = Self>
     + AddAssign
     + Vectors
+    + Compiled
     + 'static
 {
     /// The integer of the same width, ordered as the scalar is.

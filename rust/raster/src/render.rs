@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::camera::Camera;
 use crate::chunk::{CHUNK, ChunkGradients, ChunkSplats, is_sound};
-use crate::composite::{Canvas, Cotangents, Scene, composite, composite_vjp, medians};
+use crate::composite::{Canvas, Cotangents, Scene};
 use crate::dispatch::SimdLevel;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
@@ -164,7 +164,7 @@ impl<T: Real> ViewState<T> {
             pixel_mask: None,
             limits: &self.limits,
         };
-        medians(&scene, &self.canvas)
+        T::medians(&scene, &self.canvas)
     }
 
     pub(crate) fn culled(&self) -> usize {
@@ -252,9 +252,9 @@ pub(crate) fn render_view<T: Real>(
     let grid = TileGrid::new(view.camera.width, view.camera.height, limits.tile_size);
     let wanted = view.pixel_mask.map(|mask| wanted_tiles(mask, &grid));
     let mut binned = Pooled::<Binned<T>>::take();
-    binned.project(view, limits, &grid, wanted.as_deref(), image.screen);
-    binned.bin(&grid, &mut Pooled::take())?;
-    let canvas = composite(&scene(view, mode, limits, &binned), image.colors, image.alphas);
+    T::project(&mut binned, view, limits, &grid, wanted.as_deref(), image.screen);
+    T::bin(&mut binned, &grid, &mut Pooled::take())?;
+    let canvas = T::composite(&scene(view, mode, limits, &binned), image.colors, image.alphas);
     Ok(ViewState {
         grid,
         limits: *limits,
@@ -367,17 +367,29 @@ pub(crate) fn render_view_vjp<T: Real>(
     out: ViewGradients<'_, T>,
 ) -> usize {
     let scene = scene(view, mode, limits, &state.binned);
-    let gradients = composite_vjp(&scene, &state.canvas, v, !out.absgrad.is_empty());
+    let gradients = T::composite_vjp(&scene, &state.canvas, v, !out.absgrad.is_empty());
     for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
         *sum += v;
     }
+    T::project_vjp(view, limits, &state.binned, scene.channels, &gradients.slots, out);
+    gradients.tiles_skipped
+}
 
+/// Gradients of the Gaussians and of the camera, given what the compositor's vjp left in its slots.
+pub(crate) fn project_view_vjp<T: Real>(
+    view: &View<'_, T>,
+    limits: &Limits<T>,
+    binned: &Binned<T>,
+    channels: Channels<'_, T>,
+    slots: &[T],
+    out: ViewGradients<'_, T>,
+) {
     let slots = Slots {
-        values: &gradients.slots,
-        channels: scene.channels,
+        values: slots,
+        channels,
         absolute: !out.absgrad.is_empty(),
     };
-    let (stride, colored) = (scene.channels.stride, scene.channels.colored);
+    let (stride, colored) = (channels.stride, channels.colored);
     let camera = !out.viewmat.is_empty();
     let geometry = camera
         || !(out.means.is_empty()
@@ -389,11 +401,11 @@ pub(crate) fn render_view_vjp<T: Real>(
         && out.absgrad.is_empty()
         && (out.colors.is_empty() || colored == 0)
     {
-        return gradients.tiles_skipped;
+        return;
     }
     let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
-    let covers = state.binned.chunks();
-    let positions = &state.binned.bins.positions;
+    let covers = binned.chunks();
+    let positions = &binned.bins.positions;
     let count = covers.len();
     let v_viewmats: Vec<[[T; 4]; 3]> = (
         pieces(out.means, CHUNK, count),
@@ -421,7 +433,7 @@ pub(crate) fn render_view_vjp<T: Real>(
                         &mut colors[local * stride..][..colored]
                     };
                     let mut sums = slots.sum(own, v_colors);
-                    let splat = &state.binned.splats[chunk * CHUNK + local];
+                    let splat = &binned.splats[chunk * CHUNK + local];
                     if let Some(v) = absgrad.get_mut(local) {
                         let gain = T::of(2.0 * std::f64::consts::LN_2) * splat.opacity;
                         let [x, y] = slots.sum_absolutes(own);
@@ -450,7 +462,6 @@ pub(crate) fn render_view_vjp<T: Real>(
             }
         }
     }
-    gradients.tiles_skipped
 }
 
 /// A rendered image.
@@ -500,6 +511,39 @@ pub struct GaussianGrads<T> {
     pub means2d: Vec<[T; 2]>,
     /// Sums over pixels of the absolute values of what `means2d` sums; empty unless [`Renderer::with_absgrad`].
     pub absgrad: Vec<[T; 2]>,
+}
+
+impl<T: Real> GaussianGrads<T> {
+    pub(crate) fn zeros(gaussians: &Gaussians<'_, T>, absgrad: bool) -> Self {
+        let n = gaussians.len();
+        Self {
+            means: vec![[T::ZERO; 3]; n],
+            quats: vec![[T::ZERO; 4]; n],
+            scales: vec![[T::ZERO; 3]; n],
+            opacities: vec![T::ZERO; n],
+            colors: vec![T::ZERO; n * gaussians.channels],
+            viewmat: [[T::ZERO; 4]; 3],
+            background: vec![T::ZERO; gaussians.channels],
+            means2d: vec![[T::ZERO; 2]; n],
+            absgrad: vec![[T::ZERO; 2]; if absgrad { n } else { 0 }],
+        }
+    }
+
+    /// Where a view's vjp adds them.
+    pub(crate) fn slices(&mut self) -> ViewGradients<'_, T> {
+        ViewGradients {
+            means: &mut self.means,
+            quats: &mut self.quats,
+            scales: &mut self.scales,
+            opacities: &mut self.opacities,
+            colors: &mut self.colors,
+            viewmat: self.viewmat.as_flattened_mut(),
+            background: &mut self.background,
+            means2d: &mut self.means2d,
+            detach_means2d: false,
+            absgrad: &mut self.absgrad,
+        }
+    }
 }
 
 /// Renders single views.
@@ -600,35 +644,12 @@ impl<T: Real> Renderer<T> {
             background,
             pixel_mask: None,
         };
-        let n = gaussians.len();
-        let mut grads = GaussianGrads {
-            means: vec![[T::ZERO; 3]; n],
-            quats: vec![[T::ZERO; 4]; n],
-            scales: vec![[T::ZERO; 3]; n],
-            opacities: vec![T::ZERO; n],
-            colors: vec![T::ZERO; n * gaussians.channels],
-            viewmat: [[T::ZERO; 4]; 3],
-            background: vec![T::ZERO; gaussians.channels],
-            means2d: vec![[T::ZERO; 2]; n],
-            absgrad: vec![[T::ZERO; 2]; if self.absgrad { n } else { 0 }],
-        };
-        let out = ViewGradients {
-            means: &mut grads.means,
-            quats: &mut grads.quats,
-            scales: &mut grads.scales,
-            opacities: &mut grads.opacities,
-            colors: &mut grads.colors,
-            viewmat: grads.viewmat.as_flattened_mut(),
-            background: &mut grads.background,
-            means2d: &mut grads.means2d,
-            detach_means2d: false,
-            absgrad: &mut grads.absgrad,
-        };
+        let mut grads = GaussianGrads::zeros(gaussians, self.absgrad);
         let v = Cotangents {
             colors: v_colors,
             alphas: v_alphas,
         };
-        render_view_vjp(&view, self.mode, &self.limits, &frame.state, v, out);
+        render_view_vjp(&view, self.mode, &self.limits, &frame.state, v, grads.slices());
         Ok(grads)
     }
 }

@@ -86,12 +86,7 @@ impl<'a, T: Real> Harmonics<'a, T> {
     /// Red, green and blue of every direction, in their order.
     #[must_use]
     pub fn evaluate(&self) -> Vec<[T; 3]> {
-        match self.degree {
-            0 => self.evaluate_bands::<1>(),
-            1 => self.evaluate_bands::<4>(),
-            2 => self.evaluate_bands::<9>(),
-            _ => self.evaluate_bands::<16>(),
-        }
+        T::harmonics(self)
     }
 
     /// Gradients of a loss, given those with respect to the colours.
@@ -116,13 +111,26 @@ impl<'a, T: Real> Harmonics<'a, T> {
                 }
             ],
         };
-        match self.degree {
-            0 => self.vjp_bands::<1>(v_colors, &mut out),
-            1 => self.vjp_bands::<4>(v_colors, &mut out),
-            2 => self.vjp_bands::<9>(v_colors, &mut out),
-            _ => self.vjp_bands::<16>(v_colors, &mut out),
-        }
+        T::harmonics_vjp(self, v_colors, &mut out);
         Ok(out)
+    }
+
+    pub(crate) fn values(&self) -> Vec<[T; 3]> {
+        match self.degree {
+            0 => self.evaluate_bands::<1>(),
+            1 => self.evaluate_bands::<4>(),
+            2 => self.evaluate_bands::<9>(),
+            _ => self.evaluate_bands::<16>(),
+        }
+    }
+
+    pub(crate) fn add_vjp(&self, v_colors: &[[T; 3]], out: &mut HarmonicsGradients<T>) {
+        match self.degree {
+            0 => self.vjp_bands::<1>(v_colors, out),
+            1 => self.vjp_bands::<4>(v_colors, out),
+            2 => self.vjp_bands::<9>(v_colors, out),
+            _ => self.vjp_bands::<16>(v_colors, out),
+        }
     }
 
     fn gaussians(&self) -> usize {
