@@ -134,10 +134,6 @@ impl Workload {
         )
         .expect("splats")
     }
-
-    pub(crate) fn pixels(&self) -> usize {
-        self.camera.width() * self.camera.height()
-    }
 }
 
 /// From the normal distribution.
