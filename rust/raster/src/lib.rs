@@ -64,6 +64,15 @@
 //! results are the same bits for any number of threads and on every run of one machine. Machines with other vector
 //! instructions round differently, in the last bits.
 //!
+//! # Colours that depend on the direction of view
+//!
+//! [`Harmonics`] turns coefficients of spherical harmonics into the colours of one or more views, and gradients back.
+//!
+//! # Memory
+//!
+//! Scratch memory is kept between calls and shared by all renderers and batches, so that a loop allocates little but its
+//! results; [`release_memory`] frees it. A [`Frame`] holds what its backward pass needs until it is dropped.
+//!
 //! # CPU features
 //!
 //! Kernels for AVX-512, AVX2 with FMA, NEON and the baseline of the target are compiled in, whatever the flags of the
