@@ -159,8 +159,8 @@ mod tests {
     fn every_level_of_this_machine_has_a_peak() {
         for level in SimdLevel::available() {
             let peak = (0..RUNS).map(|_| run(level)).fold(0.0, f64::max) / 1e9;
-            // The slowest machine in use does more than one operation per nanosecond, no thread does 2000.
-            assert!(peak > 0.5 && peak < 2000.0, "{}: {peak}", level.name());
+            // No thread does 2000 operations per nanosecond; a debug build on a busy machine may do very few.
+            assert!(peak > 0.0 && peak < 2000.0, "{}: {peak}", level.name());
         }
     }
 
