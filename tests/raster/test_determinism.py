@@ -12,6 +12,7 @@ SCRIPT = """
 import hashlib, sys
 sys.path.insert(0, sys.argv[1])
 import torch
+from bigs.raster import rasterization
 from raster_scenes import gradients, scene
 digest = hashlib.sha256()
 # Few and many channels, shared and own inputs, several entries and cameras, with and without a mask.
@@ -29,6 +30,16 @@ for channels, batch, cameras, mode, dtype in (
         colors, alphas, grads = gradients({**inputs, **options}, render_mode=mode)
         for tensor in (colors, alphas, *grads.values()):
             digest.update(tensor.numpy().tobytes())
+coeffs = torch.rand(1500, 16, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+inputs = scene(1500, cameras=3, width=100, height=70, dtype=torch.float32)
+inputs["means"].requires_grad_()
+inputs["colors"] = coeffs
+wanted = dict(sh_degree=3, means2d="full", absgrad=True, median_depth=True, camera_model="ortho")
+colors, _, info = rasterization(**inputs, **wanted)
+colors.square().sum().backward()
+centres = info["means2d"]
+for tensor in (colors, coeffs.grad, inputs["means"].grad, centres, centres.absgrad, info["median_ids"]):
+    digest.update(tensor.detach().numpy().tobytes())
 print(digest.hexdigest())
 """
 
