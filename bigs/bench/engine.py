@@ -108,7 +108,7 @@ def lane_environment(lane: Lane) -> dict[str, str]:
     return {"RAYON_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, "BIGS_RASTER_SIMD": lane.level}
 
 
-def variants(plan: Plan, spec: WorkloadSpec, pairs: int) -> list[Variant]:
+def variants(plan: Plan, spec: WorkloadSpec, peers: list[str]) -> list[Variant]:
     """All that is timed on a workload, in the order in which one round goes through it."""
     base = Task(spec)
     found = [Variant("times", OURS, Lane(threads), base) for threads in plan.threads]
@@ -126,13 +126,9 @@ def variants(plan: Plan, spec: WorkloadSpec, pairs: int) -> list[Variant]:
             task = point.task(base)
             if task != base:
                 found.append(Variant("curve", point.label, Lane(), task))
-    if "peers" in plan.parts:
-        for name in plan.peers:
-            if _why_not(name, pairs) is None:
-                found += [
-                    Variant("peers", name, Lane(threads), replace(base, renderer=name))
-                    for threads in plan.threads
-                ]
+    for name in peers:
+        task = replace(base, renderer=name)
+        found += [Variant("peers", name, Lane(threads), task) for threads in plan.threads]
     return found
 
 
@@ -150,10 +146,12 @@ def _measure_workload(
         "height": workload.height,
         "pairs": pairs,
     }
+    left_out = {name: _why_not(name, pairs) for name in plan.peers if "peers" in plan.parts}
+    peers = [name for name, why in left_out.items() if why is None]
     measured = alternate(
-        plan, variants(plan, spec, pairs), lane_worker, lambda text: listen(f"{spec.name}: {text}")
+        plan, variants(plan, spec, peers), lane_worker, lambda text: listen(f"{spec.name}: {text}")
     )
-    rows = [_row(m, lane_worker, base) for m in measured]
+    rows = [_row(m, lane_worker, base, min(plan.threads)) for m in measured]
     result["times"] = rows
     listen(f"{spec.name}: errors")
     result["errors"] = _errors(base, first)
@@ -167,11 +165,9 @@ def _measure_workload(
         result["stages"] = _stages(plan, base, first)
     if "memory" in plan.parts:
         listen(f"{spec.name}: memory")
-        result["memory"] = _memory(plan, base, pairs)
-    if "peers" in plan.parts:
-        result["peers_left_out"] = {
-            name: why for name in plan.peers if (why := _why_not(name, pairs)) is not None
-        }
+        slow = {row["label"] for row in rows if row["wall"] > 1e3 * plan.budget}
+        result["memory"] = _memory(base, [name for name in (OURS, *peers) if name not in slow])
+    result["peers_left_out"] = {name: why for name, why in left_out.items() if why is not None}
     return result
 
 
@@ -200,7 +196,9 @@ def alternate(
     return measured
 
 
-def _row(m: Measured, lane_worker: Callable[[Lane], Worker], base: Task) -> dict[str, Any]:
+def _row(
+    m: Measured, lane_worker: Callable[[Lane], Worker], base: Task, fewest_threads: int
+) -> dict[str, Any]:
     variant = m.variant
     row: dict[str, Any] = {
         "part": variant.part,
@@ -210,7 +208,7 @@ def _row(m: Measured, lane_worker: Callable[[Lane], Worker], base: Task) -> dict
         "runs": len(m.samples),
         **m.median(),
     }
-    if variant.part in ("peers", "levels") and variant.lane.threads == 1:
+    if variant.part == "levels" or (variant.part == "peers" and variant.lane.threads == fewest_threads):
         row |= _errors_by_rule(variant.task, base, lane_worker(variant.lane))
     return row
 
@@ -283,11 +281,7 @@ def _stages(plan: Plan, base: Task, first: Worker) -> dict[str, float]:
     return {name: min(values) for name, values in runs.items()}
 
 
-def _memory(plan: Plan, base: Task, pairs: int) -> dict[str, float]:
-    renderers = [
-        OURS,
-        *(name for name in plan.peers if "peers" in plan.parts and _why_not(name, pairs) is None),
-    ]
+def _memory(base: Task, renderers: list[str]) -> dict[str, float]:
     found = {}
     for name in renderers:
         process = Worker(lane_environment(Lane()))

@@ -10,6 +10,9 @@ from bigs.bench.errors import COLUMNS
 
 Rows = list[tuple[str, ...]]
 
+# What `_raster.time_engine` calls its stages.
+_STAGES = ("project", "bin", "composite", "composite vjp", "project vjp")
+
 
 class Table(NamedTuple):
     """Rows of equal length, the first being the heading, and what one has to know to read them."""
@@ -78,19 +81,15 @@ def _times(report: dict[str, Any]) -> Table:
         times = _selected(workload, "times")
         single = next((row["wall"] for row in times if row["threads"] == 1), None)
         for row in times:
-            busy = [1e6 * row[key] / max(workload["pairs"], 1) for key in ("forward_cpu", "backward_cpu")]
-            shares = [
-                100 * flops / max(ns * peak, 1e-9)
-                for flops, ns in zip((FLOPS_FORWARD, FLOPS_BACKWARD), busy, strict=True)
-            ]
+            pairs = [_per_pair(row[key], workload) for key in ("forward_cpu", "backward_cpu")]
             rows.append(
                 (
                     name,
                     str(row["threads"]),
                     *(_ms(row[key]) for key in ("forward_cpu", "backward_cpu", "cpu", "wall")),
                     "" if single is None else f"{single / row['wall']:.2f}",
-                    " / ".join(f"{ns:.2f}" for ns in busy),
-                    " / ".join(f"{share:.0f}" for share in shares),
+                    _both(pairs, ".2f"),
+                    _both(_shares_of_peak(pairs, peak), ".0f"),
                 )
             )
     sizes = "; ".join(
@@ -135,22 +134,56 @@ def _levels(report: dict[str, Any]) -> Table:
 
 
 def _stages(report: dict[str, Any]) -> Table:
-    stages = [workload.get("stages") for workload in report["workloads"].values()]
-    names = [key for key in next((s for s in stages if s), {}) if not key.startswith("torch ")]
-    rows: Rows = [("workload", *names, "torch forward", "torch backward", "torch / engine")]
+    rows: Rows = [
+        (
+            "workload",
+            *_STAGES,
+            "kernels ns/pair",
+            "kernels % of peak",
+            "engine",
+            "through torch",
+            "torch / engine",
+        )
+    ]
+    peak = report["peaks"][report["machine"]["level"]]
     for name, workload in report["workloads"].items():
         if "stages" in workload:
             found = workload["stages"]
-            torch_ms, engine = (
-                found[f"{prefix}forward"] + found[f"{prefix}backward"] for prefix in ("torch ", "")
+            whole, engine = (found[f"{way}forward"] + found[f"{way}backward"] for way in ("torch ", ""))
+            kernels = [_per_pair(found[key], workload) for key in ("composite", "composite vjp")]
+            rows.append(
+                (
+                    name,
+                    *(_ms(found[stage]) for stage in _STAGES),
+                    _both(kernels, ".2f"),
+                    _both(_shares_of_peak(kernels, peak), ".0f"),
+                    _ms(engine),
+                    _ms(whole),
+                    f"{whole / engine:.2f}",
+                )
             )
-            columns = (*names, "torch forward", "torch backward")
-            rows.append((name, *(_ms(found[key]) for key in columns), f"{torch_ms / engine:.2f}"))
     note = (
-        "One thread, wall milliseconds, fastest run. The stages and the calls forward and backward are the "
-        "Rust crate's, without numpy or torch; backward there also gives the gradient of the view matrix."
+        "One thread, wall milliseconds, fastest run. Stages and engine are calls of the Rust crate "
+        "without numpy or torch; engine is forward and backward, where it also gives the gradient of the "
+        "view matrix. Kernels are the two compositing stages: ns per pair and share of the peak, forward / "
+        "backward."
     )
     return Table("Stages, and what torch adds", note, rows)
+
+
+def _per_pair(milliseconds: float, workload: dict[str, Any]) -> float:
+    """Nanoseconds."""
+    return 1e6 * milliseconds / max(workload["pairs"], 1)
+
+
+def _shares_of_peak(nanoseconds: list[float], peak: float) -> list[float]:
+    """Per cent of the peak that forward and backward reach with these times a pair."""
+    flops = (FLOPS_FORWARD, FLOPS_BACKWARD)
+    return [100 * f / max(ns * peak, 1e-9) for f, ns in zip(flops, nanoseconds, strict=True)]
+
+
+def _both(values: list[float], form: str) -> str:
+    return " / ".join(format(value, form) for value in values)
 
 
 def _memory(report: dict[str, Any]) -> Table:

@@ -15,7 +15,7 @@ from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
-from bigs.bench.calls import Call, Task, cached_workload
+from bigs.bench.calls import OURS, Call, Task, cached_workload
 from bigs.bench.errors import relative_errors
 from bigs.bench.machine import peak_of
 from bigs.bench.pairs import count_pairs
@@ -75,6 +75,9 @@ def _environment(changes: Mapping[str, str]) -> Iterator[None]:
         os.environ.update(before)
 
 
+_peer_results: dict[Task, dict[str, np.ndarray]] = {}
+
+
 # A workload has fewer variants than this; those of the one before it go.
 @lru_cache(maxsize=64)
 def _call(task: Task) -> Call:
@@ -88,24 +91,28 @@ def sample(task: Task) -> Sample:
     comes first in a round.
     """
     call = _call(task)
-    found = [_timed(call)]
-    if found[0].wall > _TURN:
-        return found[0]
+    first, result = _timed(call)
+    if task.renderer != OURS:
+        # A peer may take minutes: its errors are those of a run that was timed.
+        _peer_results[task] = result
+    if first.wall > _TURN:
+        return first
+    found = [first]
     while len(found) < 4 or sum(s.wall for s in found) < _TURN:
-        found.append(_timed(call))
+        found.append(_timed(call)[0])
     return Sample(*(statistics.median(values) for values in zip(*found[1:], strict=True)))
 
 
-def _timed(call: Call) -> Sample:
+def _timed(call: Call) -> tuple[Sample, dict[str, np.ndarray]]:
     start = time.process_time(), time.perf_counter()
     image = call.forward()
     middle = time.process_time(), time.perf_counter()
-    call.backward(image)
+    gradients = call.backward(image)
     end = time.process_time(), time.perf_counter()
     forward, backward = (
         [1e3 * (b - a) for a, b in zip(*ends, strict=True)] for ends in ((start, middle), (middle, end))
     )
-    return Sample(*forward, *backward)
+    return Sample(*forward, *backward), {"image": image.detach().numpy(), **gradients}
 
 
 def counters(task: Task) -> dict[str, int]:
@@ -134,6 +141,8 @@ def pairs(task: Task) -> int:
 
 
 def _fresh_result(task: Task) -> dict[str, np.ndarray]:
+    if task in _peer_results:
+        return _peer_results[task]
     call = _call(task)
     image = call.forward()
     return {"image": image.detach().numpy(), **call.backward(image)}
