@@ -116,7 +116,7 @@ def time_engine(
     settings: RasterSettings,
     v_colors: NDArray[np.float32],
 ) -> list[tuple[str, float]]:
-    """Wall seconds of the stages project, bin and composite, then of the whole calls forward and backward.
+    """Wall seconds of the stages with their vjps, then of the whole calls forward and backward.
 
     Gaussians are means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3]; the camera is
     viewmat [4, 4] and K [3, 3]; v_colors [H, W, 3]. All are float32 and C-contiguous.

@@ -25,7 +25,8 @@ pub(crate) fn fma_peak_gflops(py: Python<'_>) -> f64 {
 
 type Array<'py> = PyReadonlyArrayDyn<'py, f32>;
 
-/// Wall seconds of one pass: the stages project, bin and composite, then the whole calls forward and backward.
+/// Wall seconds of one pass: the stages project, bin and composite with their vjps, then the whole calls forward and
+/// backward.
 ///
 /// means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]`, opacities `[N]`, colors `[N, 3]`, viewmat `[4, 4]`, K `[3, 3]`,
 /// v_colors `[H, W, 3]`: float32, C-contiguous. Raises ValueError.
@@ -82,20 +83,26 @@ fn timed(
     let bin = lap();
     black_box(stages.composite());
     let composite = lap();
+    let v_alphas = vec![0.0; camera.width() * camera.height()];
+    lap();
+    stages.composite_vjp(v_colors, &v_alphas)?;
+    let composite_vjp = lap();
+    black_box(stages.project_vjp());
+    let project_vjp = lap();
     drop(stages);
 
     let renderer = Renderer::new(settings, RenderMode::Rgb)?;
     lap();
     let frame = renderer.render(gaussians, camera, None)?;
     let forward = lap();
-    let v_alphas = vec![0.0; frame.alphas.len()];
-    lap();
     black_box(renderer.render_vjp(gaussians, camera, None, &frame, v_colors, &v_alphas)?);
     let backward = lap();
     Ok(vec![
         ("project", project),
         ("bin", bin),
         ("composite", composite),
+        ("composite vjp", composite_vjp),
+        ("project vjp", project_vjp),
         ("forward", forward),
         ("backward", backward),
     ])
