@@ -29,6 +29,9 @@ from bigs.bench.workloads import KINDS, WorkloadSpec, make_workload
 # transmittance 3, gradients of colour 6, alpha 11 and opacity 1, and five moments of the offset 11.
 FLOPS_FORWARD, FLOPS_BACKWARD = 35, 57
 
+# Measurements of the peak, of which the largest counts: it belongs to the CPU, not to what else runs on it.
+_PEAK_TRIES = 5
+
 
 class Lane(NamedTuple):
     """A process to measure in."""
@@ -78,7 +81,9 @@ def measure(plan: Plan, listen: Callable[[str], None] = lambda text: None) -> di
     }
     with _workers() as lane_worker:
         report["peaks"] = {
-            level or _raster.simd_level(): lane_worker(Lane(1, level)).run(_raster.fma_peak_gflops)
+            level or _raster.simd_level(): max(
+                lane_worker(Lane(1, level)).run(_raster.fma_peak_gflops) for _ in range(_PEAK_TRIES)
+            )
             for level in ("", *(lower_levels() if "levels" in plan.parts else ()))
         }
         for spec in plan.workloads:
