@@ -14,7 +14,7 @@ use crate::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::project::{Lens, ScreenInfo, Splat};
 use crate::real::Real;
 use crate::settings::{Limits, RasterSettings, RenderMode};
-use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, count_pairs, fill_bins, sort_by_depth};
+use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, bin_tiles};
 
 /// Everything one image is made of.
 #[derive(Clone, Copy, Debug)]
@@ -123,11 +123,8 @@ impl<T: Real> Binned<T> {
     /// Sorts the projected splats by depth and lists those of every tile.
     pub(crate) fn bin(&mut self, grid: &TileGrid, scratch: &mut BinScratch<T>) -> Result<(), RasterError> {
         let chunks = self.splats.len().div_ceil(CHUNK);
-        count_pairs(&mut self.covers[..chunks], grid.len(), &mut self.bins)?;
-        let covers = &self.covers[..chunks];
-        sort_by_depth(&self.splats, covers, scratch);
-        fill_bins(covers, scratch, &mut self.bins);
-        Ok(())
+        let covers = &mut self.covers[..chunks];
+        bin_tiles(&self.splats, covers, grid.len(), scratch, &mut self.bins)
     }
 }
 

@@ -310,7 +310,7 @@ impl<T: Real> BinScratch<T> {
 }
 
 /// Puts the Gaussians that reach some tile in order of depth, ties by index.
-pub(crate) fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut BinScratch<T>) {
+fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut BinScratch<T>) {
     scratch.order.clear();
     for (chunk, (splats, cover)) in splats.chunks(CHUNK).zip(covers).enumerate() {
         let first = (chunk * CHUNK) as u32;
@@ -325,12 +325,8 @@ pub(crate) fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scra
     radix_sort_with(&mut scratch.order, &mut scratch.sort);
 }
 
-/// Counts the pairs of every tile, and numbers those of every Gaussian.
-pub(crate) fn count_pairs(
-    covers: &mut [Cover],
-    tiles: usize,
-    bins: &mut TileBins,
-) -> Result<(), RasterError> {
+/// Numbers the pairs of every chunk.
+fn number_pairs(covers: &mut [Cover]) -> Result<(), RasterError> {
     let mut total = 0u32;
     for cover in covers.iter_mut() {
         cover.base = total;
@@ -339,7 +335,12 @@ pub(crate) fn count_pairs(
             .and_then(|pairs| total.checked_add(pairs))
             .ok_or(RasterError::TooManyIntersections)?;
     }
-    let offsets = filled(&mut bins.offsets, tiles + 1, 0);
+    Ok(())
+}
+
+/// Counts the pairs of every tile.
+fn count_pairs(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
+    let offsets = filled(offsets, tiles + 1, 0);
     for &tile in covers.iter().flat_map(Cover::pairs) {
         offsets[tile as usize + 1] += 1;
     }
@@ -348,11 +349,28 @@ pub(crate) fn count_pairs(
         sum += *offset;
         *offset = sum;
     }
+}
+
+/// Sorts splats by depth and lists those of every tile.
+pub(crate) fn bin_tiles<T: Real>(
+    splats: &[Splat<T>],
+    covers: &mut [Cover],
+    tiles: usize,
+    scratch: &mut BinScratch<T>,
+    bins: &mut TileBins,
+) -> Result<(), RasterError> {
+    number_pairs(covers)?;
+    let covers = &*covers;
+    rayon::join(
+        || sort_by_depth(splats, covers, scratch),
+        || count_pairs(covers, tiles, &mut bins.offsets),
+    );
+    fill_bins(covers, scratch, bins);
     Ok(())
 }
 
 /// Lists the splats of every tile, after [`sort_by_depth`] and [`count_pairs`].
-pub(crate) fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut BinScratch<T>, bins: &mut TileBins) {
+fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut BinScratch<T>, bins: &mut TileBins) {
     let pairs = bins.offsets.last().map_or(0, |&end| end as usize);
     let ranks = stale(&mut bins.ranks, pairs);
     let positions = stale(&mut bins.positions, pairs);
