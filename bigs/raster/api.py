@@ -56,8 +56,8 @@ def rasterization(
         means: centres in the world, metres.
         quats: rotations w x y z, of any length; the zero quaternion is no rotation.
         scales: standard deviations along the rotated axes, metres.
-        opacities: in [0, 1]; above 1 a Gaussian is opaque further out (alpha is limited, as in gsplat), below 0
-            it is not there.
+        opacities: in [0, 1]; above 1 a Gaussian is opaque further out (alpha is limited, as in gsplat), below
+            0 it is not there.
         colors: any D ≥ 1 channels; with a camera axis they must have all batch axes too. With `sh_degree` the
             coefficients of spherical harmonics, and D is 3.
         viewmats: world to camera, OpenCV axes; the 3×3 part must be invertible.

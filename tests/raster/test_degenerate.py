@@ -128,3 +128,31 @@ def test_odd_images(width, height):
     assert colors.shape == (1, height, width, 3) and alphas.shape == (1, height, width, 1)
     assert relative(colors, slow_colors) < 1e-12
     assert all(relative(grads[name], slow[name]) < 1e-9 for name in grads)
+
+
+def test_a_centre_at_the_end_of_numbers_without_a_threshold():
+    inputs = scene(n=10, dtype=torch.float32)
+    inputs["Ks"][0, 0, 2] = 3e38
+    colors, alphas, grads = gradients(inputs, settings=RasterSettings(alpha_threshold=0.0))
+    assert (alphas == 0).all() and torch.equal(colors, inputs["backgrounds"][:, None, None].expand_as(colors))
+    assert all(grad.isfinite().all() for grad in grads.values())
+
+
+@pytest.mark.parametrize("scale", [1e-120, 1e120])
+def test_a_camera_in_absurd_units_is_no_singular_one(scale):
+    inputs = scene(n=20)
+    expected = rasterization(**inputs).colors
+    inputs["viewmats"][:, :3] *= scale
+    settings = RasterSettings(near_plane=1e-2 * scale, far_plane=1e10 * scale)
+    assert relative(rasterization(**inputs, settings=settings).colors, expected) < 1e-12
+
+
+def test_the_gradient_of_a_centre_is_finite_under_the_largest_opacity():
+    inputs = scene(n=20, dtype=torch.float32)
+    inputs["opacities"][3] = 3.4e38
+    inputs["means"].requires_grad_()
+    colors, _, info = rasterization(**inputs, means2d="full", absgrad=True)
+    info["means2d"].retain_grad()
+    colors.square().sum().backward()
+    assert info["means2d"].grad.isfinite().all() and info["means2d"].absgrad.isfinite().all()
+    assert (info["means2d"].grad != 0).any()

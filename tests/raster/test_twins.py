@@ -73,7 +73,9 @@ def test_no_background():
 
 
 # A faint image is 1 - T with T next to 1: single precision has few digits left of it.
-@pytest.mark.parametrize(("size", "dtype"), [(1.0, torch.float32), (1.0, torch.float64), (0.02, torch.float64)])
+@pytest.mark.parametrize(
+    ("size", "dtype"), [(1.0, torch.float32), (1.0, torch.float64), (0.02, torch.float64)]
+)
 def test_antialiased(size, dtype):
     inputs = scene(n=120, dtype=dtype)
     inputs["scales"] = inputs["scales"] * size * torch.tensor([1.0, 0.3, 0.01], dtype=dtype)
