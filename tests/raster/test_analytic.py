@@ -8,7 +8,6 @@ import pytest
 import torch
 from raster_scenes import relative, scene
 
-from bigs.checks import InputError
 from bigs.raster import RasterSettings, rasterization
 
 
@@ -91,17 +90,6 @@ def test_the_camera_must_stand_clear_of_the_near_plane():
     inputs["means"][0, 2] = beyond[0]
     colors, alphas, info = rasterization(**inputs)
     assert info["n_visible"] == 1 and alphas.max() > 0 and colors.isfinite().all()
-
-
-def test_too_many_pairs_is_an_error_before_memory_runs_out():
-    n, side = 90_000, 1000
-    inputs = facing(n, side, side)
-    inputs["scales"][:] = 100.0
-    inputs["opacities"][:] = 0.9
-    started = time.process_time()
-    with pytest.raises(InputError, match=r"2\^32"):
-        rasterization(**inputs, settings=RasterSettings(tile_size=4))
-    assert time.process_time() - started < 10
 
 
 @pytest.mark.slow
