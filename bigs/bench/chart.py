@@ -27,7 +27,7 @@ def draw_curve(report: dict[str, Any]) -> bytes:
     Above against float64 with the default thresholds, below against float64 without any: what is exact by
     the rule that all renderers share need not be near what the rule leaves out.
     """
-    figure_module = _matplotlib()
+    figure_module, ticker = _matplotlib(), importlib.import_module("matplotlib.ticker")
     names = [name for name, workload in report["workloads"].items() if "curve" in workload]
     figure = figure_module.Figure(figsize=(3.3 * len(names) + 1.2, 6.2), dpi=100, layout="constrained")
     axes = figure.subplots(2, len(names), squeeze=False, sharex="col", sharey="row")
@@ -39,6 +39,9 @@ def draw_curve(report: dict[str, Any]) -> bytes:
             _draw_settings(axis, workload["curve"], rule)
             _draw_peers(axis, workload, rule)
             axis.minorticks_off()
+            # Times of one workload may all lie between two powers of ten.
+            axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 3)))
+            axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
             axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
             axis.spines[["top", "right"]].set_visible(False)
             axis.tick_params(labelsize=7)

@@ -153,7 +153,7 @@ PEERS: dict[str, Peer] = {
         "pip install --no-deps gsplat jaxtyping",
         "its torch reference, gsplat.cuda._torch_impl; plain torch stands in for two steps that it has "
         "only as CUDA kernels",
-        400,
+        280,
         _gsplat_torch,
     ),
 }
