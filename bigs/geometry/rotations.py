@@ -81,6 +81,19 @@ def mean_rotation(matrices: Tensor, weights: Tensor) -> Tensor:
     return project_to_rotation((weights[..., None, None] * matrices).sum(-3))
 
 
+def robust_mean_rotation(matrices: Tensor) -> Tensor:
+    """A mean of rotations [..., N, 3, 3] that a minority of outliers hardly moves: [..., 3, 3].
+
+    Frobenius distances to the mean re-weight it, as in Weiszfeld's iteration for the geometric median.
+    """
+    weights = torch.ones(matrices.shape[:-2])
+    for _ in range(8):
+        mean = mean_rotation(matrices, weights)
+        distance = (matrices - mean[..., None, :, :]).square().sum((-1, -2)).sqrt()
+        weights = 1.0 / distance.clamp_min(1e-2)
+    return mean
+
+
 def project_to_rotation(matrices: Tensor) -> Tensor:
     """The proper rotations [..., 3, 3] nearest to `matrices` [..., 3, 3] in the Frobenius norm."""
     u, _, vh = torch.linalg.svd(matrices)

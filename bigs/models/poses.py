@@ -42,11 +42,30 @@ class RayPositions(nn.Module):
         self.ray = nn.Parameter(torch.zeros(frames, 2))
         self.log_depth = nn.Parameter(torch.zeros(frames))
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """Positions [B, 3] of `frames` [B]."""
-        depth = torch.exp(self.base_log_depth[frames] + self.log_depth[frames])
-        ray = self.base_ray[frames] + self.ray[frames]
-        return torch.cat([ray * depth[:, None], depth[:, None]], dim=-1)
+    def start(self, frames: Tensor) -> Tensor:
+        """The positions [B, 3] that the residuals of `frames` [B] start from."""
+        depth = self.base_log_depth[frames].exp()[:, None]
+        return torch.cat([self.base_ray[frames] * depth, depth], dim=-1)
+
+    def forward(self, frames: Tensor, start: Tensor | None = None, freedom: Tensor | None = None) -> Tensor:
+        """Positions [B, 3] of `frames` [B]; for `start` and `freedom` [B] see `HandPoses.forward`."""
+        ray, log_depth = self.ray[frames], self.log_depth[frames]
+        if freedom is not None:
+            ray, log_depth = freedom[:, None] * ray, freedom * log_depth
+        if start is None:
+            start_ray, start_log_depth = self.base_ray[frames], self.base_log_depth[frames]
+        else:
+            start_ray, start_log_depth = start[:, :2] / start[:, 2:], start[:, 2].log()
+        depth = torch.exp(start_log_depth + log_depth)
+        return torch.cat([(start_ray + ray) * depth[:, None], depth[:, None]], dim=-1)
+
+    @torch.no_grad()
+    def restart(self, positions: Tensor) -> None:
+        """Take `positions` [T, 3] for the start; the residuals become zero."""
+        self.base_ray.copy_(positions[:, :2] / positions[:, 2:])
+        self.base_log_depth.copy_(positions[:, 2].log())
+        self.ray.zero_()
+        self.log_depth.zero_()
 
 
 class HandPoses(nn.Module):
@@ -58,20 +77,46 @@ class HandPoses(nn.Module):
         frames = global_orient.shape[0]
         self.register_buffer("base_orient", global_orient)
         self.register_buffer("base_pose", hand_pose)
+        # What was known before any image was looked at; `base_pose` moves on.
+        self.register_buffer("estimated_pose", hand_pose.clone())
         self.orient = nn.Parameter(torch.zeros(frames, 3))
         self.pose = nn.Parameter(torch.zeros(frames, 15, 3))
         # What a per-frame regressor gets wrong in every frame alike.
         self.pose_bias = nn.Parameter(torch.zeros(15, 3))
         self.position = RayPositions(wrist)
 
-    def forward(self, frames: Tensor) -> HandFrames:
-        """The poses of `frames` [B] (integer indices)."""
-        residual = axis_angle_to_matrix(self.pose[frames] + self.pose_bias)
+    def start(self, frames: Tensor) -> HandFrames:
+        """The poses that the residuals of `frames` [B] start from."""
+        return HandFrames(self.base_orient[frames], self.base_pose[frames], self.position.start(frames))
+
+    def forward(
+        self, frames: Tensor, start: HandFrames | None = None, freedom: Tensor | None = None
+    ) -> HandFrames:
+        """The poses of `frames` [B] (integer indices).
+
+        Args:
+            frames: [B].
+            start: what the residuals start from instead of the module's own start.
+            freedom: [B] what the residuals are multiplied by: how far a frame may leave its start.
+        """
+        orient, pose = self.orient[frames], self.pose[frames] + self.pose_bias
+        if freedom is not None:
+            orient, pose = freedom[:, None] * orient, freedom[:, None, None] * pose
+        base = self.start(frames) if start is None else start
         return HandFrames(
-            axis_angle_to_matrix(self.orient[frames]) @ self.base_orient[frames],
-            self.base_pose[frames] @ residual,
-            self.position(frames),
+            axis_angle_to_matrix(orient) @ base.global_orient,
+            base.hand_pose @ axis_angle_to_matrix(pose),
+            self.position(frames, None if start is None else start.wrist, freedom),
         )
+
+    @torch.no_grad()
+    def restart(self, poses: HandFrames) -> None:
+        """Take `poses` of all T frames for the start; the residuals become zero."""
+        self.base_orient.copy_(poses.global_orient)
+        self.base_pose.copy_(poses.hand_pose)
+        for residual in (self.orient, self.pose, self.pose_bias):
+            residual.zero_()
+        self.position.restart(poses.wrist)
 
 
 class ObjectPoses(nn.Module):

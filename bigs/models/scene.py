@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
+from bigs.models.grasps import Grasps
 from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_hand
 from bigs.models.lighting import Lighting
 from bigs.models.object_splats import CanonicalObject, ObjectSplats, pose_object
@@ -62,6 +63,12 @@ class Scene(nn.Module):
         self.betas = nn.ParameterDict({side: nn.Parameter(value) for side, value in betas.items()})
         self.base_betas = {side: value.clone() for side, value in betas.items()}
         self.hand_poses = nn.ModuleDict(dict(hand_poses))
+        self.grasps = nn.ModuleDict(
+            {
+                side: Grasps(len(poses.base_orient), mirrored=side == "left")
+                for side, poses in hand_poses.items()
+            }
+        )
         self.object_splats = object_splats
         self.object_poses = object_poses
         self.object_surface = object_surface
@@ -108,8 +115,21 @@ class Scene(nn.Module):
 
     def hand_frames(self, side: Side, frames: Tensor) -> HandFrames:
         """Poses of the canonical hand at `frames` [B]; a left hand's wrist is seen in the mirror."""
-        pose = self.hand_poses[side](frames)
+        pose = self.hand_pose(side, frames)
         return pose._replace(wrist=mirror_points(pose.wrist)) if side == "left" else pose
+
+    def hand_pose(self, side: Side, frames: Tensor) -> HandFrames:
+        """The same with the wrist where it is; in a grasp the object carries the hand."""
+        poses, grasps = self.hand_poses[side], self.grasps[side]
+        held = grasps.held(frames)
+        if not held.any():
+            return poses(frames)
+        carried, own = grasps(frames, self.object_frames(frames)), poses.start(frames)
+        start = (
+            torch.where(held.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            for a, b in zip(carried, own, strict=True)
+        )
+        return poses(frames, HandFrames(*start), torch.where(held, grasps.slack, 1.0))
 
     def object_frames(self, frames: Tensor) -> ObjectFrames:
         return self.object_poses(frames)

@@ -52,7 +52,25 @@ class ScaleSearchStage:
     frames: int = 12
 
 
-Stage = OptimizeStage | ScaleSearchStage
+@dataclass(frozen=True)
+class GraspStage:
+    """Grasps: from here on the object carries a hand while it holds on (see `models.grasps`)."""
+
+    name: str = "grasps"
+    step: Step = "interacting-subjects"
+    # A hand that moves less than this against the object between two frames holds it, metres.
+    speed: float = 0.005
+    # Fewer frames than this are no grasp.
+    least: int = 4
+    # A hand that changes its grasp within so many frames turns evenly from one to the next.
+    longest_move: int = 16
+    # What a frame of a grasp may add of its own, as a factor on its residuals; 0 makes grasps rigid.
+    slack: float = 0.1
+    # Up to so many frames of a faulty estimate do not end a grasp.
+    bridge: int = 3
+
+
+Stage = OptimizeStage | ScaleSearchStage | GraspStage
 
 
 @dataclass(frozen=True)

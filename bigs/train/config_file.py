@@ -13,7 +13,7 @@ import yaml
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
-from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage
+from bigs.train.config import RunConfig
 
 
 def to_plain(config: Any) -> Any:
@@ -142,9 +142,11 @@ def _build_tuple(arguments: tuple[Any, ...], plain: Any, where: str) -> tuple[An
 def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> Any:
     if not isinstance(plain, dict):
         raise InputError(f"{where}: expected a stage, found {plain!r}")
-    optimize = {f.name for f in dataclasses.fields(OptimizeStage)}
-    searches = {f.name for f in dataclasses.fields(ScaleSearchStage)} - optimize
-    kind = ScaleSearchStage if searches & set(plain) else typing.get_args(kinds)[0]
+    first, *others = typing.get_args(kinds)
+    common = {f.name for f in dataclasses.fields(first)}
+    kind = next(
+        (kind for kind in others if ({f.name for f in dataclasses.fields(kind)} - common) & set(plain)), first
+    )
     return _build_dataclass(kind, {"name": name, **plain}, where)
 
 

@@ -23,7 +23,8 @@ from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
 from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
-from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.grasps import find_grasps
 from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.optim import GROUPS
@@ -101,6 +102,11 @@ def fit(
         if isinstance(stage, ScaleSearchStage):
             factor, _, _ = search_object_scale(scene, stage, sources.touching, sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
+        elif isinstance(stage, GraspStage):
+            for side, stretches in find_grasps(scene, stage, sources.touching).items():
+                spans = ", ".join(f"{stretch.start}-{stretch.stop - 1}" for stretch in stretches)
+                text = f"{side} hand holds the object in frames {spans or '(none)'}"
+                listen({"event": "note", "stage": stage.name, "text": text})
         else:
             continues = position.resume if position and index == first else None
             last = _optimise(scene, stage, index, sources, config, continues, checkpoints, digest, listen)
@@ -136,7 +142,7 @@ def _optimise(
 
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
-    if isinstance(stage, ScaleSearchStage):
+    if isinstance(stage, ScaleSearchStage | GraspStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
@@ -243,6 +249,12 @@ def check_plan(config: RunConfig) -> None:
             least[f"{where}.candidates"] = (stage.candidates, 1)
             least[f"{where}.image_size"] = (stage.image_size, 0)
             least[f"{where}.frames"] = (stage.frames, 1)
+            continue
+        if isinstance(stage, GraspStage):
+            least[f"{where}.speed"] = (stage.speed, 0.0)
+            least[f"{where}.least"] = (stage.least, 2)
+            least[f"{where}.slack"] = (stage.slack, 0.0)
+            least[f"{where}.bridge"] = (stage.bridge, 0)
             continue
         least |= {
             f"{where}.steps": (stage.steps, 0),

@@ -14,9 +14,12 @@ from bigs.models.scene import Scene
 _LIGHT = {"light": "clip", "shade": "shade"}
 # Group name -> where its parameters are, below a hand's or the object's modules.
 _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
+_HAND_POSE = ("betas", "orient", "pose", "pose_bias", "ray", "depth")
+# Of a whole grasp, relative to the object.
+_GRASP = {"grasp_orient": "orient", "grasp_pose": "pose", "grasp_position": "position"}
 _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
-    *(f"hand.{name}" for name in (*_HAND_FIELD, "betas", "orient", "pose", "pose_bias", "ray", "depth")),
+    *(f"hand.{name}" for name in (*_HAND_FIELD, *_HAND_POSE, *_GRASP)),
     *(f"object.{name}" for name in (*_OBJECT_FIELD, "orient", "ray", "depth", "scale")),
     "scene.light",
     "scene.shade",
@@ -46,6 +49,8 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
             ]
         elif name == "betas":
             owners = list(scene.betas.values())
+        elif name in _GRASP:
+            owners = [getattr(grasps, _GRASP[name]) for grasps in scene.grasps.values()]
         else:
             owners = [_pose_parameter(poses, name) for poses in scene.hand_poses.values()]
     elif scene.object_splats is None:

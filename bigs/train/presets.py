@@ -7,7 +7,7 @@ from dataclasses import replace
 from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.train.config import OptimizeStage, RunConfig, ScaleSearchStage
+from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage
 from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
@@ -45,12 +45,22 @@ _HANDS_FINE = replace(
     image_size=120,
     final_lr=0.1,
 )
-_CONTACT = replace(
+# Grasps are known: what all frames of one agree on moves together.
+_GRASP_RATES = {"hand.grasp_orient": 0.006, "hand.grasp_pose": 0.008, "hand.grasp_position": 0.001}
+_HELD = replace(
     _HANDS_FINE,
+    name="held",
+    steps=50,
+    lrs={**_HANDS_FINE.lrs, **_GRASP_RATES, "hand.betas": 0.01},
+    weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0},
+    final_lr=0.3,
+)
+_CONTACT = replace(
+    _HELD,
     name="contact",
     step="interacting-subjects",
-    steps=60,
-    weights={**_HANDS_FINE.weights, "contact": 0.1, "penetration": 0.01},
+    weights={**_HELD.weights, "contact": 0.1, "penetration": 0.01},
+    final_lr=0.1,
 )
 _APPEARANCE = OptimizeStage(
     name="appearance",
@@ -82,6 +92,9 @@ _JOINT = OptimizeStage(
         "hand.pose": 0.01,
         "hand.ray": 0.0015,
         "hand.depth": 0.003,
+        "hand.grasp_orient": 0.003,
+        "hand.grasp_pose": 0.006,
+        "hand.grasp_position": 0.0005,
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
         "hand.geometry": 1e-3,
@@ -117,7 +130,20 @@ _JOINT = OptimizeStage(
     frames_per_step=6,
 )
 
-FAST = RunConfig(stages=(_HANDS_COARSE, _HANDS_FINE, _APPEARANCE, ScaleSearchStage(), _CONTACT, _JOINT))
+FAST = RunConfig(
+    stages=(
+        _HANDS_COARSE,
+        _HANDS_FINE,
+        ScaleSearchStage(),
+        GraspStage(),
+        _HELD,
+        _APPEARANCE,
+        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
+        GraspStage(name="grasps-2"),
+        _CONTACT,
+        _JOINT,
+    )
+)
 
 # For a little clip, in well under two minutes on two cores.
 DEMO = replace(
@@ -125,8 +151,11 @@ DEMO = replace(
     stages=(
         _HANDS_COARSE,
         replace(_HANDS_FINE, steps=60),
-        replace(_APPEARANCE, steps=40),
         ScaleSearchStage(),
+        GraspStage(),
+        replace(_HELD, steps=40),
+        replace(_APPEARANCE, steps=40),
+        GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
         replace(_JOINT, steps=110),
     ),
@@ -140,8 +169,12 @@ FULL = replace(
     stages=(
         replace(_HANDS_COARSE, steps=100),
         replace(_HANDS_FINE, steps=200, image_size=160),
-        replace(_APPEARANCE, steps=200),
         ScaleSearchStage(),
+        GraspStage(),
+        replace(_HELD, steps=100, image_size=160),
+        replace(_APPEARANCE, steps=200),
+        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
+        GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=100, image_size=160),
         replace(_JOINT, steps=700),
         replace(
@@ -164,8 +197,10 @@ SMOKE = replace(
     stages=(
         replace(_HANDS_COARSE, steps=25),
         replace(_HANDS_FINE, steps=10, image_size=80),
-        replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         ScaleSearchStage(candidates=15),
+        GraspStage(),
+        replace(_HELD, steps=8, image_size=80),
+        replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
         replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
     ),

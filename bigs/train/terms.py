@@ -243,7 +243,11 @@ def orient_prior(step: Step) -> Tensor:
 
 
 def pose_prior(step: Step) -> Tensor:
-    return _mean(squared_norm(poses.pose + poses.pose_bias) for poses in step.scene.hand_poses.values())
+    """Squared finger residuals of every frame, those of its grasp included."""
+    return _mean(
+        squared_norm(poses.pose + poses.pose_bias + step.scene.grasps[side].pose_residuals())
+        for side, poses in step.scene.hand_poses.items()
+    )
 
 
 def betas_prior(step: Step) -> Tensor:

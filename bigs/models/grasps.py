@@ -1,0 +1,88 @@
+"""Grasps: stretches of a clip over which a hand moves with the object it holds.
+
+A hand that holds a rigid object keeps one pose in the object's frame. While the object turns, the frames of a
+grasp are then so many views of one still hand, and what no single view shows, depth and bending towards the
+camera, is seen from the side in another.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation
+from bigs.hand import mirror_rotation
+from bigs.models.poses import HandFrames, ObjectFrames
+
+
+class Grasps(nn.Module):
+    """The grasps of one hand; row g of every table is grasp g. There is room for one a frame.
+
+    Rotations are those of the canonical hand, so for a left hand they are relative to the object as the
+    mirror shows it; positions are in the object's own frame, metres at its initial size.
+    """
+
+    def __init__(self, n_frames: int, *, mirrored: bool) -> None:
+        """No grasp yet. `mirrored` for a left hand."""
+        super().__init__()
+        self.mirrored = mirrored
+        self.register_buffer("of_frame", torch.full((n_frames,), -1))
+        # What a frame of a grasp may add of its own: the factor on its residuals.
+        self.register_buffer("slack", torch.zeros(()))
+        self.register_buffer("base_orient", torch.eye(3).repeat(n_frames, 1, 1))
+        self.register_buffer("base_pose", torch.eye(3).repeat(n_frames, 15, 1, 1))
+        self.register_buffer("base_position", torch.zeros(n_frames, 3))
+        self.orient = nn.Parameter(torch.zeros(n_frames, 3))
+        self.pose = nn.Parameter(torch.zeros(n_frames, 15, 3))
+        self.position = nn.Parameter(torch.zeros(n_frames, 3))
+
+    @property
+    def count(self) -> int:
+        return int(self.of_frame.max()) + 1
+
+    def held(self, frames: Tensor) -> Tensor:
+        """Which of `frames` [B] belong to a grasp, [B] bool."""
+        return self.of_frame[frames] >= 0
+
+    def pose_residuals(self) -> Tensor:
+        """Finger residuals [T, 15, 3] of every frame's grasp; zero where there is none."""
+        held = self.of_frame >= 0
+        return self.pose[self.of_frame.clamp_min(0)] * held[:, None, None]
+
+    def forward(self, frames: Tensor, object_frames: ObjectFrames) -> HandFrames:
+        """The hand's poses at `frames` [B] as the object carries it; meaningless where it is not held."""
+        g = self.of_frame[frames].clamp_min(0)
+        orient = axis_angle_to_matrix(self.orient[g]) @ self.base_orient[g]
+        position = self.base_position[g] + self.position[g]
+        return HandFrames(
+            self._seen(object_frames.rotations) @ orient,
+            self.base_pose[g] @ axis_angle_to_matrix(self.pose[g]),
+            object_frames.scale * (object_frames.rotations @ position[..., None])[..., 0]
+            + object_frames.centers,
+        )
+
+    @torch.no_grad()
+    def set(self, of_frame: Tensor, slack: float, hand: HandFrames, object_frames: ObjectFrames) -> None:
+        """Start grasps from all frames' poses of hand and object: a grasp takes the mean of its frames.
+
+        Args:
+            of_frame: [T] number of each frame's grasp, -1 for none.
+            slack: factor on the residuals of frames in a grasp; 0 makes it rigid.
+            hand: poses of the canonical hand in all T frames, the wrist in true camera space.
+            object_frames: the object's poses in all T frames.
+        """
+        for parameter in self.parameters():
+            parameter.zero_()
+        self.of_frame.copy_(of_frame)
+        self.slack.fill_(slack)
+        orient = self._seen(object_frames.rotations).transpose(-1, -2) @ hand.global_orient
+        away = (hand.wrist - object_frames.centers)[..., None]
+        position = (object_frames.rotations.transpose(-1, -2) @ away)[..., 0] / object_frames.scale
+        for g in range(self.count):
+            own = self.of_frame == g
+            self.base_orient[g] = robust_mean_rotation(orient[own])
+            self.base_pose[g] = robust_mean_rotation(hand.hand_pose[own].transpose(0, 1))
+            self.base_position[g] = position[own].median(0).values
+
+    def _seen(self, rotations: Tensor) -> Tensor:
+        return mirror_rotation(rotations) if self.mirrored else rotations
