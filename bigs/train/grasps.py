@@ -72,11 +72,15 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
         if held.any():
             correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
             corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, held))
-            poses = poses._replace(hand_pose=torch.where(held[:, None, None, None], poses.hand_pose, corrected))
+            poses = poses._replace(
+                hand_pose=torch.where(held[:, None, None, None], poses.hand_pose, corrected)
+            )
         own.restart(poses)
         orient = scene.hand_pose(side, frames).global_orient
         seen = scene.object_frames(frames).rotations
-        turned = turned_between(orient, mirror_rotation(seen) if side == "left" else seen, found[side], stage.longest_move)
+        turned = turned_between(
+            orient, mirror_rotation(seen) if side == "left" else seen, found[side], stage.longest_move
+        )
         own.base_orient.copy_(turned)
     return found
 

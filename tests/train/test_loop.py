@@ -16,7 +16,8 @@ from bigs.hand import HandModel
 from bigs.models.hand_splats import silhouette_hand
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
-from bigs.train.config import OptimizeStage
+from bigs.train.config import GraspStage, OptimizeStage
+from bigs.train.grasps import find_grasps
 from bigs.train.loop import StageProgress, StageState, choose_frames, run_stage, stage_entities
 from bigs.train.optim import GROUPS, group_parameters
 from bigs.train.targets import Targets
@@ -133,6 +134,8 @@ def test_every_group_can_be_reached_by_some_term(scene: Scene, evidence: Evidenc
     )
     if group.startswith("scene"):
         stage = replace(stage, lrs={group: 1e-2, "hand.color": 1e-3})
+    if "grasp" in group:
+        find_grasps(scene, GraspStage(least=2), evidence.touching)
     # A fresh decoder's last layer is zero, so what lies below it gets a gradient from the second step on.
     if group.endswith("triplane"):
         stage = replace(stage, lrs={group: 1e-2, group.replace("triplane", "appearance"): 1e-2})

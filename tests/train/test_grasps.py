@@ -1,0 +1,183 @@
+"""Grasps: where they are found, what they tie together, and what they leave alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from toy_scenes import cube_scene
+
+from bigs.checks import InputError
+from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, rotation_angle
+from bigs.hand import mirror_rotation, procedural_hand
+from bigs.models.scene import Scene
+from bigs.train.config import GraspStage, RunConfig
+from bigs.train.fit import check_plan
+from bigs.train.grasps import carried_errors, find_grasps, still_frames, turned_between
+
+STAGE = GraspStage()
+FRAMES = 24
+
+
+def joints_at(positions: torch.Tensor) -> torch.Tensor:
+    """A hand's joints [T, 21, 3] whose wrist is at `positions` [T] metres along x."""
+    hand = torch.rand(21, 3, generator=torch.Generator().manual_seed(0))
+    return 0.1 * hand + torch.stack([positions, 0 * positions, 0 * positions], -1)[:, None]
+
+
+def moved(*speeds: float) -> torch.Tensor:
+    return torch.tensor([0.0, *speeds]).cumsum(0)
+
+
+def test_a_move_separates_two_grasps() -> None:
+    positions = moved(*[0.001] * 6, *[0.02] * 8, *[0.001] * 9)
+    touching = torch.ones(len(positions))
+    assert still_frames(joints_at(positions), touching, STAGE) == [range(0, 7), range(14, 24)]
+
+
+def test_a_hand_that_does_not_touch_holds_nothing() -> None:
+    positions = moved(*[0.0] * 13)
+    touching = torch.ones(14)
+    touching[4:8] = 0
+    assert still_frames(joints_at(positions), touching, STAGE) == [range(0, 4), range(8, 14)]
+
+
+def test_one_faulty_frame_does_not_end_a_grasp_but_a_new_place_does() -> None:
+    spike = moved(*[0.0] * 6, 0.04, -0.04, *[0.0] * 6)
+    everywhere = torch.ones(len(spike))
+    assert still_frames(joints_at(spike), everywhere, STAGE) == [range(0, len(spike))]
+    jump = moved(*[0.0] * 6, 0.04, 0.04, *[0.0] * 6)
+    assert still_frames(joints_at(jump), everywhere, STAGE) == [range(0, 7), range(8, len(jump))]
+
+
+def test_short_stretches_are_no_grasps() -> None:
+    positions = moved(*[0.02] * 4, *[0.0] * 2, *[0.02] * 4)
+    assert still_frames(joints_at(positions), torch.ones(11), STAGE) == []
+
+
+def turning_scene(wander: float = 0.0) -> Scene:
+    """The held cube turning about the camera's vertical; the hands' estimates wander by `wander` metres."""
+    scene = cube_scene({side: procedural_hand(side) for side in ("right", "left")}, frames=FRAMES)
+    turn = torch.linspace(0, 2.0, FRAMES)
+    rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
+    noise = wander * torch.randn(FRAMES, 3, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        scene.object_poses.base_orient.copy_(rotations)
+        centers = scene.object_frames(torch.arange(FRAMES)).centers
+        for side in scene.sides:
+            poses = scene.hand_poses[side]
+            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
+            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
+            poses.position.restart(centers + away + noise)
+    return scene
+
+
+EVERYWHERE = {"right": torch.ones(FRAMES), "left": torch.ones(FRAMES)}
+ALL = torch.arange(FRAMES)
+
+
+def test_the_object_carries_hands_that_hold_it() -> None:
+    scene = turning_scene(wander=0.0008)
+    truth = turning_scene()
+    found = find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    assert found == {"right": [range(0, FRAMES)], "left": [range(0, FRAMES)]}
+    for side in scene.sides:
+        joints = scene.in_object_frame(scene.hand_points(side, ALL)[1], ALL)
+        assert (joints - joints[:1]).abs().max() < 1e-5, "still in the object's frame"
+        error = scene.hand_points(side, ALL)[1] - truth.hand_points(side, ALL)[1]
+        assert error.norm(dim=-1).max() < 0.0008, "a mean of 24 frames is nearer than any of them"
+
+
+def test_a_grasp_moves_as_one_and_a_frame_only_by_its_slack() -> None:
+    scene = turning_scene()
+    find_grasps(scene, GraspStage(slack=0.1), EVERYWHERE)
+    before = scene.hand_points("left", ALL)[1]
+    with torch.no_grad():
+        scene.grasps["left"].position[0] += torch.tensor([0.01, 0.0, 0.0])
+    shift = scene.hand_points("left", ALL)[1] - before
+    torch.testing.assert_close(shift.norm(dim=-1), torch.full((FRAMES, 21), 0.01), atol=1e-5, rtol=0)
+    with torch.no_grad():
+        scene.grasps["left"].position.zero_()
+        scene.hand_poses["left"].position.log_depth[3] = math.log(1.1) / 0.1
+    wrists = scene.hand_points("left", ALL)[1][:, 0]
+    ratio = wrists[:, 2] / before[:, 0, 2]
+    torch.testing.assert_close(ratio[3], torch.tensor(1.1), atol=1e-5, rtol=0)
+    torch.testing.assert_close(ratio[4:], torch.ones(FRAMES - 4), atol=1e-5, rtol=0)
+
+
+def test_finding_again_changes_nothing() -> None:
+    scene = turning_scene(wander=0.0008)
+    find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    before = {side: scene.hand_points(side, ALL)[1] for side in scene.sides}
+    find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    for side in scene.sides:
+        torch.testing.assert_close(scene.hand_points(side, ALL)[1], before[side], atol=1e-5, rtol=0)
+
+
+def test_a_hand_that_holds_nothing_stays_where_it_was() -> None:
+    scene = turning_scene(wander=0.0008)
+    with torch.no_grad():
+        scene.hand_poses["right"].pose[:, 3, 2] = 0.2
+        scene.hand_poses["right"].pose_bias[4, 1] = 0.1
+    before = scene.hand_points("right", ALL)[1]
+    assert find_grasps(scene, STAGE, {"right": torch.zeros(FRAMES), "left": torch.zeros(FRAMES)}) == {
+        "right": [],
+        "left": [],
+    }
+    torch.testing.assert_close(scene.hand_points("right", ALL)[1], before, atol=1e-6, rtol=0)
+    assert not scene.hand_poses["right"].pose.any(), "residuals became the start"
+
+
+def test_gradients_of_a_held_hand_reach_grasp_and_object() -> None:
+    scene = turning_scene()
+    find_grasps(scene, STAGE, EVERYWHERE)
+    scene.hand_points("right", torch.tensor([2]))[1].square().sum().backward()
+    grasps = scene.grasps["right"]
+    for parameter in (grasps.orient, grasps.pose, grasps.position):
+        assert parameter.grad[0].abs().max() > 0 and not parameter.grad[1:].any()
+    assert scene.object_poses.orient.grad[2].abs().max() > 0
+    assert not scene.object_poses.orient.grad[3].any()
+
+
+def test_known_errors_are_carried_to_their_neighbours_and_fade_to_the_mean() -> None:
+    known = torch.zeros(60, dtype=torch.bool)
+    known[:10] = known[50:] = True
+    errors = torch.where(torch.arange(60) < 30, 1.0, -1.0)[:, None].repeat(1, 2)
+    carried = carried_errors(errors, known, noise=0.1)
+    assert carried[11].min() > 0.8 and carried[48].max() < -0.8
+    torch.testing.assert_close(carried[29] + carried[30], torch.zeros(2), atol=1e-4, rtol=0)
+    constant = carried_errors(torch.ones(60, 2), known, noise=0.1)
+    assert (constant - 1.0).abs().max() < 0.25, "what every known frame shows, all have"
+
+
+def test_a_hand_turns_evenly_from_grasp_to_grasp_as_seen_from_the_object() -> None:
+    carrier = axis_angle_to_matrix(torch.linspace(0, 1, 20)[:, None] * torch.tensor([0.3, 1.0, 0.2]))
+    turn = torch.tensor([0.0, 0.0, 1.2])
+    held = [range(0, 6), range(15, 20)]
+    relative = torch.eye(3).repeat(20, 1, 1)
+    relative[15:] = axis_angle_to_matrix(turn)
+    wrong = relative.clone()
+    wrong[6:15] = axis_angle_to_matrix(torch.tensor([2.0, 0.0, 0.0]))
+    orient = turned_between(carrier @ wrong, carrier, held, 16)
+    angles = rotation_angle(carrier.transpose(-1, -2) @ orient)
+    torch.testing.assert_close(angles[[0, 5]], torch.zeros(2), atol=1e-3, rtol=0)
+    torch.testing.assert_close(angles[15:], torch.full((5,), 1.2), atol=1e-3, rtol=0)
+    steps = angles[5:16].diff()
+    assert (steps > 0).all() and steps[[0, -1]].max() < 0.3 * steps.max(), "slow, fast, slow"
+    untouched = turned_between(carrier @ wrong, carrier, held, 8)
+    torch.testing.assert_close(untouched, carrier @ wrong)
+
+
+def test_a_robust_mean_ignores_a_minority() -> None:
+    generator = torch.Generator().manual_seed(0)
+    good = axis_angle_to_matrix(0.02 * torch.randn(9, 3, generator=generator))
+    bad = axis_angle_to_matrix(torch.tensor([[2.0, 0.0, 0.0]])).repeat(3, 1, 1)
+    mean = robust_mean_rotation(torch.cat([good, bad]))
+    assert rotation_angle(mean) < 0.05
+
+
+@pytest.mark.parametrize(("name", "value"), [("speed", -1.0), ("least", 1), ("slack", -0.1), ("bridge", -1)])
+def test_thresholds_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"stages.grasps.{name}"):
+        check_plan(RunConfig(stages=(GraspStage(**{name: value}),)))
