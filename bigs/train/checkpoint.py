@@ -12,8 +12,9 @@ from safetensors.torch import save
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
+from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
-from bigs.train.loop import StageState
+from bigs.train.loop import NUMBERS, StageState
 
 FORMAT = "bigs-checkpoint-1"
 FILE_NAME = "latest.safetensors"
@@ -39,7 +40,7 @@ def save_checkpoint(folder: Path, scene: Scene, digest: str, stage: int, state: 
     tensors = {f"scene.{name}": value for name, value in scene.state_dict().items()}
     position: dict[str, Any] = {"stage": stage, "step": None}
     if state is not None:
-        position |= {key: getattr(state, key) for key in ("step", "best", "best_step", "smoothed")}
+        position |= {key: getattr(state, key) for key in NUMBERS}
         for index, moments in state.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
     metadata = {"format": FORMAT, "digest": digest, "position": json.dumps(position)}
@@ -70,6 +71,8 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
             f"{path}: expected a checkpoint of this clip, hand model, configuration and version, "
             f"found one of another run (digest {metadata.get('digest')} instead of {digest})"
         )
+    if "scene.object_splats.shift" in tensors and not isinstance(scene.object_splats, ObjectDetail):
+        scene.object_splats = ObjectDetail(len(tensors["scene.object_splats.shift"]))
     scene.load_state_dict(
         {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
     )
@@ -81,5 +84,5 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
         if name.startswith("optimizer."):
             _, index, key = name.split(".")
             moments.setdefault(int(index), {})[key] = value
-    resume = {key: position[key] for key in ("step", "best", "best_step", "smoothed")}
+    resume = {key: position[key] for key in NUMBERS}
     return Position(position["stage"], resume | {"moments": moments})

@@ -70,7 +70,19 @@ class GraspStage:
     bridge: int = 3
 
 
-Stage = OptimizeStage | ScaleSearchStage | GraspStage
+@dataclass(frozen=True)
+class SplitStage:
+    """The object's field is evaluated a last time, and its Gaussians split (see `models.object_detail`)."""
+
+    name: str = "split"
+    step: Step = "single-subject"
+    # Each Gaussian becomes parts x parts smaller ones.
+    parts: int = 2
+    # Gaussians less opaque than this are pruned.
+    least_opacity: float = 0.05
+
+
+Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage
 
 
 @dataclass(frozen=True)

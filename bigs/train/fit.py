@@ -19,11 +19,12 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
+from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
 from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
-from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage, Stage
 from bigs.train.grasps import find_grasps
 from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
@@ -44,6 +45,7 @@ class FitReport:
 
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
+    retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
 
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
@@ -107,9 +109,17 @@ def fit(
                 spans = ", ".join(f"{stretch.start}-{stretch.stop - 1}" for stretch in stretches)
                 text = f"{side} hand holds the object in frames {spans or '(none)'}"
                 listen({"event": "note", "stage": stage.name, "text": text})
+        elif isinstance(stage, SplitStage):
+            with torch.no_grad():
+                whole = scene.object_splats()
+            scene.object_splats = split_object(whole, stage.parts, stage.least_opacity)
+            text = f"{len(whole.means)} Gaussians of the object become {len(scene.object_splats.shift)}"
+            listen({"event": "note", "stage": stage.name, "text": text})
         else:
             continues = position.resume if position and index == first else None
-            last = _optimise(scene, stage, index, sources, config, continues, checkpoints, digest, listen)
+            last = _optimise(
+                scene, stage, index, sources, config, continues, checkpoints, digest, report, listen
+            )
             if last.step < stage.steps:
                 report.skipped.append(
                     f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had settled"
@@ -130,6 +140,7 @@ def _optimise(
     resume: dict[str, Any] | None,
     checkpoints: Path | None,
     digest: str,
+    report: FitReport,
     listen: Listener,
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
@@ -137,7 +148,20 @@ def _optimise(
         if checkpoints and progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             save_checkpoint(checkpoints, scene, digest, index, state)
 
-    return run_stage(scene, stage, sources.evidence(stage), config.seed + 1000 * index, resume, after_step)
+    def warn(text: str) -> None:
+        listen({"event": "note", "stage": stage.name, "text": text})
+        report.retreats.append(text)
+
+    return run_stage(
+        scene,
+        stage,
+        sources.evidence(stage),
+        config.seed + 1000 * index,
+        resume,
+        after_step,
+        config.checkpoint_every,
+        warn,
+    )
 
 
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
@@ -146,6 +170,8 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
+    if isinstance(stage, SplitStage):
+        return "the clip has no object" if scene.object_splats is None else None
     subjects = {group.split(".")[0] for group in stage.lrs}
     if subjects == {"hand"} and not scene.sides:
         return "the clip has no hand"
@@ -255,6 +281,10 @@ def check_plan(config: RunConfig) -> None:
             least[f"{where}.least"] = (stage.least, 2)
             least[f"{where}.slack"] = (stage.slack, 0.0)
             least[f"{where}.bridge"] = (stage.bridge, 0)
+            continue
+        if isinstance(stage, SplitStage):
+            least[f"{where}.parts"] = (stage.parts, 1)
+            least[f"{where}.least_opacity"] = (stage.least_opacity, 0.0)
             continue
         least |= {
             f"{where}.steps": (stage.steps, 0),

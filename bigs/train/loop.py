@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -36,6 +37,13 @@ class StageState(NamedTuple):
     best: float  # smoothed loss that the stopping rule compares with
     best_step: int
     smoothed: float
+    retreats: int  # how often the stage went back after something that was not finite
+
+
+# The parts of `StageState` that are plain numbers.
+NUMBERS = ("step", "best", "best_step", "smoothed", "retreats")
+# A stage gives up after so many retreats; each halves its rates.
+MOST_RETREATS = 4
 
 
 def stage_entities(scene: Scene, stage: OptimizeStage) -> tuple[Entity, ...]:
@@ -71,8 +79,13 @@ def run_stage(
     seed: int,
     resume: dict[str, Any] | None = None,
     after_step: Callable[[StageProgress, StageState], None] = lambda progress, state: None,
+    keep_every: int = 100,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> StageState:
     """Optimise `scene` in place.
+
+    A step whose loss or gradient is not finite is not taken: the stage goes back to the last state that was
+    kept and on from there at half its rates.
 
     Args:
         scene: the scene.
@@ -81,10 +94,12 @@ def run_stage(
         seed: of the choice of frames.
         resume: steps done, moments and stopping state as `checkpoint.load_checkpoint` returns them.
         after_step: called after every step.
+        keep_every: steps between the states that are kept to go back to.
+        warn: told what was not finite, and where the stage went back to.
 
     Raises:
         InputError: the stage names an unknown group or term.
-        FloatingPointError: the loss is not finite; names the terms.
+        FloatingPointError: losses or gradients are not finite however small the steps; names the first.
     """
     image_terms = IMAGE_TERMS[stage.step]
     unknown = [name for name in stage.weights if name not in TERMS and name not in image_terms]
@@ -92,10 +107,10 @@ def run_stage(
         accepted = ", ".join([*image_terms, *TERMS])
         raise InputError(f"stage {stage.name}: expected terms out of {accepted}, found {unknown[0]!r}")
     optimizer = make_optimizer(scene, stage.lrs)
-    state = StageState(0, optimizer, float("inf"), 0, float("nan"))
+    state = StageState(0, optimizer, float("inf"), 0, float("nan"), 0)
     if resume is not None:
         optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
-        state = state._replace(**{key: resume[key] for key in ("step", "best", "best_step", "smoothed")})
+        state = state._replace(**{key: resume[key] for key in NUMBERS})
 
     entities = stage_entities(scene, stage)
     frozen = {
@@ -110,6 +125,7 @@ def run_stage(
         # A frozen field is evaluated once for the whole stage.
         fixed = scene.canonical(frozen) if needs_canonical else {}
 
+    kept = _Kept(state)
     while state.step < stage.steps and not _has_settled(stage, state):
         began = time.perf_counter()
         moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
@@ -119,24 +135,27 @@ def run_stage(
             entities if needs_canonical else (),
             {**fixed, **scene.canonical(moving)},
             choose_frames(scene.n_frames, stage, seed, state.step),
+            "labels" in stage.weights,
         )
-        terms = {}
-        for name in stage.weights:
-            try:
-                terms[name] = (image_terms.get(name) or TERMS[name])(step)
-            except InputError as error:
-                # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
-                where = f"stage {stage.name}, step {state.step}"
-                raise FloatingPointError(f"{where}: {name} is not finite: {error}") from error
-        loss = weighted_sum(terms, stage.weights)
-        if not torch.isfinite(loss):
-            bad = [name for name, value in terms.items() if not torch.isfinite(value)]
-            raise FloatingPointError(f"stage {stage.name}, step {state.step}: {', '.join(bad)} is not finite")
-        set_cosine_rates(optimizer, state.step / max(stage.steps, 1), stage.final_lr)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        terms, problem = _evaluate(step, stage)
+        loss = weighted_sum(terms, stage.weights) if problem is None else None
+        if loss is not None:
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            problem = _unbounded_gradient(scene)
+        if loss is None or problem is not None:
+            where = f"stage {stage.name}, step {state.step}: {problem}"
+            if state.retreats == MOST_RETREATS:
+                raise FloatingPointError(where)
+            state = kept.restore(optimizer)._replace(retreats=state.retreats + 1)
+            warn(f"{where}; back to step {state.step} with half the rates")
+            continue
+        progress = state.step / max(stage.steps, 1)
+        set_cosine_rates(optimizer, progress, stage.final_lr, 0.5**state.retreats)
         optimizer.step()
         state = _advance(stage, state, float(loss.detach()))
+        if state.step % keep_every == 0:
+            kept = _Kept(state)
         after_step(
             StageProgress(
                 state.step,
@@ -148,6 +167,58 @@ def run_stage(
             state,
         )
     return state
+
+
+def _evaluate(step: Step, stage: OptimizeStage) -> tuple[dict[str, Tensor], str | None]:
+    """The stage's terms, and which of them is not finite."""
+    terms = {}
+    for name in stage.weights:
+        try:
+            terms[name] = (IMAGE_TERMS[stage.step].get(name) or TERMS[name])(step)
+        except InputError as error:
+            # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
+            return terms, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
+    bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+    return terms, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
+
+
+def _first_unbounded(scene: Scene) -> str:
+    """The first parameter that is not finite, with its place: for per-frame parameters that is the frame."""
+    for name, values in scene.named_parameters():
+        wrong = torch.nonzero(~torch.isfinite(values))
+        if len(wrong):
+            return f" ({name} at {wrong[0].tolist()})"
+    return ""
+
+
+def _unbounded_gradient(scene: Scene) -> str | None:
+    for name, values in scene.named_parameters():
+        # A sum is finite only if all of it is, save for overflow, which is no better.
+        if values.grad is not None and not torch.isfinite(values.grad.sum()):
+            wrong = torch.nonzero(~torch.isfinite(values.grad))
+            place = f" at {wrong[0].tolist()}" if len(wrong) else ""
+            return f"the gradient of {name} is not finite{place}"
+    return None
+
+
+class _Kept:
+    """A state to go back to: copies of what is trained and of the optimiser's moments."""
+
+    def __init__(self, state: StageState) -> None:
+        self._state = state
+        self._values = [p.detach().clone() for p in _trained(state.optimizer)]
+        self._moments = copy.deepcopy(state.optimizer.state_dict()["state"])
+
+    @torch.no_grad()
+    def restore(self, optimizer: torch.optim.Optimizer) -> StageState:
+        for parameter, value in zip(_trained(optimizer), self._values, strict=True):
+            parameter.copy_(value)
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": copy.deepcopy(self._moments)})
+        return self._state
+
+
+def _trained(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def _advance(stage: OptimizeStage, state: StageState, loss: float) -> StageState:

@@ -17,16 +17,18 @@ _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
 _HAND_POSE = ("betas", "orient", "pose", "pose_bias", "ray", "depth")
 # Of a whole grasp, relative to the object.
 _GRASP = {"grasp_orient": "orient", "grasp_pose": "pose", "grasp_position": "position"}
+# Of an object that was split.
+_DETAIL = ("shift", "size", "opacity", "color")
 _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
     *(f"hand.{name}" for name in (*_HAND_FIELD, *_HAND_POSE, *_GRASP)),
-    *(f"object.{name}" for name in (*_OBJECT_FIELD, "orient", "ray", "depth", "scale")),
+    *(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL, "orient", "ray", "depth", "scale")),
     "scene.light",
     "scene.shade",
 )
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in _HAND_FIELD),
-    "object": tuple(f"object.{name}" for name in _OBJECT_FIELD),
+    "object": tuple(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL)),
 }
 
 
@@ -55,8 +57,9 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
             owners = [_pose_parameter(poses, name) for poses in scene.hand_poses.values()]
     elif scene.object_splats is None:
         owners = []
-    elif name in _OBJECT_FIELD:
-        owners = [getattr(scene.object_splats, name)]
+    elif name in (*_OBJECT_FIELD, *_DETAIL):
+        # An object has a field until it is split, and parameters of its own from then on.
+        owners = [getattr(scene.object_splats, name)] if hasattr(scene.object_splats, name) else []
     else:
         owners = [
             scene.object_poses.log_scale if name == "scale" else _pose_parameter(scene.object_poses, name)
@@ -91,8 +94,10 @@ def make_optimizer(scene: Scene, lrs: Mapping[str, float]) -> torch.optim.Adam:
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def set_cosine_rates(optimizer: torch.optim.Optimizer, progress: float, final: float) -> None:
-    """Set every group's rate for `progress` in [0, 1]: from its start down to `final` times that."""
-    factor = final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress))
+def set_cosine_rates(
+    optimizer: torch.optim.Optimizer, progress: float, final: float, caution: float = 1.0
+) -> None:
+    """Set every group's rate for `progress` in [0, 1]: `caution` times its start down to `final` times that."""
+    factor = caution * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)))
     for group in optimizer.param_groups:
         group["lr"] = group["start_lr"] * factor

@@ -43,6 +43,7 @@ class Step:
     entities: tuple[Entity, ...]  # rendered alone or together in this stage
     canonical: dict[Entity, CanonicalHand | CanonicalObject]
     frames: Tensor  # [B]
+    with_labels: bool = True  # whether the joint rendering has label channels
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
 
     @property
@@ -86,13 +87,15 @@ class Step:
 
     @cached_property
     def together(self) -> RenderOutput:
-        """All subjects in one pass; after the three colours, one label channel per entity."""
+        """All subjects in one pass; after the three colours, one label channel per entity if labels count."""
         labels = torch.eye(len(self.entities))
         parts = []
         for entity, label in zip(self.entities, labels, strict=True):
             part = self.scene.posed(entity, self.canonical[entity], self.frames)
-            channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
-            parts.append(part._replace(colors=channels))
+            if self.with_labels:
+                channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
+                part = part._replace(colors=channels)
+            parts.append(part)
         return self.render(concatenate(parts))
 
     @cached_property

@@ -14,6 +14,7 @@ from toy_scenes import cube_scene
 from bigs.checks import InputError
 from bigs.hand import HandModel
 from bigs.models.hand_splats import silhouette_hand
+from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
 from bigs.train.config import GraspStage, OptimizeStage
@@ -134,6 +135,8 @@ def test_every_group_can_be_reached_by_some_term(scene: Scene, evidence: Evidenc
     )
     if group.startswith("scene"):
         stage = replace(stage, lrs={group: 1e-2, "hand.color": 1e-3})
+    if group.removeprefix("object.") in ("shift", "size", "opacity", "color"):
+        scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
     if "grasp" in group:
         find_grasps(scene, GraspStage(least=2), evidence.touching)
     # A fresh decoder's last layer is zero, so what lies below it gets a gradient from the second step on.
@@ -297,3 +300,81 @@ def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None
             run_stage(scene, stage, evidence, 0, after_step=lambda p, _, seen=seen: seen.append(p.loss))
             assert seen[0] >= 0, name
             assert all(torch.isfinite(p).all() for p in scene.parameters()), name
+
+
+# --- what does not last ---
+
+
+def faulty_at(monkeypatch: pytest.MonkeyPatch, *steps: int) -> list[int]:
+    """Let `pose_prior` be NaN the first time that each of `steps` is evaluated; returns the count of calls."""
+    pending, calls, true = list(steps), [0], TERMS["pose_prior"]
+
+    def term(step: object) -> torch.Tensor:
+        calls[0] += 1
+        value = true(step)
+        if pending and calls[0] == pending[0]:
+            pending.pop(0)
+            return value * float("nan")
+        return value
+
+    monkeypatch.setitem(TERMS, "pose_prior", term)
+    return calls
+
+
+PRIOR = replace(
+    TOGETHER,
+    steps=12,
+    lrs={"hand.pose": 1e-2},
+    weights={"pose_prior": 1.0},
+    frames_per_step=0,
+)
+
+
+def test_a_passing_fault_goes_back_to_the_kept_state_and_on_with_half_the_rates(
+    scene: Scene, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with torch.no_grad():
+        scene.hand_poses["left"].pose.fill_(0.5)
+    calls = faulty_at(monkeypatch, 8)
+    told: list[str] = []
+    steps: list[int] = []
+    state = run_stage(
+        scene, PRIOR, evidence, 0, None, lambda p, s: steps.append(p.step), keep_every=5, warn=told.append
+    )
+    assert state.step == 12 and state.retreats == 1 and calls[0] == 15
+    assert steps == [1, 2, 3, 4, 5, 6, 7, 6, 7, 8, 9, 10, 11, 12]
+    assert len(told) == 1 and "step 7: pose_prior is not finite" in told[0] and "back to step 5" in told[0]
+    assert state.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 * PRIOR.final_lr, rel=0.3)
+    assert all(torch.isfinite(p).all() for p in scene.parameters())
+
+
+def test_what_was_kept_is_what_the_stage_goes_on_from(
+    scene: Scene, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with torch.no_grad():
+        scene.hand_poses["left"].pose.fill_(0.5)
+    faulty_at(monkeypatch, 3)
+    poses: dict[int, list[torch.Tensor]] = {}
+
+    def note(progress: StageProgress, _: StageState) -> None:
+        poses.setdefault(progress.step, []).append(scene.hand_poses["left"].pose.detach().clone())
+
+    before = values(scene)
+    run_stage(scene, replace(PRIOR, steps=4), evidence, 0, None, note, keep_every=50)
+    # The stage failed at its third step and began again from its very start, more slowly.
+    first, second = poses[1]
+    start = before["hand_poses.left.pose"]
+    torch.testing.assert_close(second - start, 0.5 * (first - start), rtol=0.05, atol=1e-7)
+
+
+def test_a_gradient_that_is_not_finite_is_named_and_not_taken(
+    scene: Scene, evidence: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # sqrt of a square at zero: the value is fine, its derivative is 0 / 0.
+    monkeypatch.setitem(
+        TERMS, "pose_prior", lambda step: step.scene.hand_poses["right"].pose.square().sum().sqrt()
+    )
+    before = values(scene)
+    with pytest.raises(FloatingPointError, match=r"the gradient of hand_poses\.right\.pose is not finite at"):
+        run_stage(scene, PRIOR, evidence, 0)
+    torch.testing.assert_close(values(scene)["hand_poses.right.pose"], before["hand_poses.right.pose"])
