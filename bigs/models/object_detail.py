@@ -1,7 +1,7 @@
-"""The object's Gaussians on their own: what a field said, split into finer parts, each with its own parameters.
+"""The object's Gaussians on their own: what a field said, in finer parts with parameters of their own.
 
-A triplane of 128 texels shows no print on a label, and evaluating it for every finer Gaussian in every step would
-cost ten times the rendering. Once the field has given shape and rough colours it is evaluated a last time.
+A triplane of 128 texels shows no print on a label, and evaluating it for every finer Gaussian in every step
+would cost ten times the rendering. Once it has given shape and rough colours it is evaluated a last time.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def make_optimizer(scene: Scene, lrs: Mapping[str, float]) -> torch.optim.Adam:
 def set_cosine_rates(
     optimizer: torch.optim.Optimizer, progress: float, final: float, caution: float = 1.0
 ) -> None:
-    """Set every group's rate for `progress` in [0, 1]: `caution` times its start down to `final` times that."""
+    """Set every group's rate for `progress` in [0, 1]: `caution` times its start, down to `final` of that."""
     factor = caution * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)))
     for group in optimizer.param_groups:
         group["lr"] = group["start_lr"] * factor

@@ -306,7 +306,7 @@ def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None
 
 
 def faulty_at(monkeypatch: pytest.MonkeyPatch, *steps: int) -> list[int]:
-    """Let `pose_prior` be NaN the first time that each of `steps` is evaluated; returns the count of calls."""
+    """Let `pose_prior` be NaN at its `steps`-th evaluations, counted from 1; returns the count of calls."""
     pending, calls, true = list(steps), [0], TERMS["pose_prior"]
 
     def term(step: object) -> torch.Tensor:
