@@ -47,6 +47,7 @@ Usage: render [scene.ply] [options]
   --orthographic        no perspective
   --antialiased         compensate thin Gaussians for what the pixel grid adds to them
   --save-ply PATH       also write the scene as a PLY file
+  --detail FACTOR       of the built-in scene; 1 by default, fifty thousand Gaussians
 ";
 
 #[derive(Clone, Debug)]
