@@ -3,11 +3,13 @@
 import math
 import resource
 import time
+from pathlib import Path
 
 import pytest
 import torch
 from raster_scenes import relative, scene
 
+from bigs.checks import InputError
 from bigs.raster import RasterSettings, rasterization
 
 
@@ -90,6 +92,37 @@ def test_the_camera_must_stand_clear_of_the_near_plane():
     inputs["means"][0, 2] = beyond[0]
     colors, alphas, info = rasterization(**inputs)
     assert info["n_visible"] == 1 and alphas.max() > 0 and colors.isfinite().all()
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc to bound the memory")
+def test_too_many_pairs_is_an_error_before_memory_runs_out():
+    n, side = 90_000, 1000
+    inputs = facing(n, side, side)
+    inputs["scales"][:] = 100.0
+    inputs["opacities"][:] = 0.9
+    started = time.process_time()
+    # Should it fill the memory after all, then with an error of its own and not the machine's.
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + 3 * 2**30, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"2\^32"):
+            rasterization(**inputs, settings=RasterSettings(tile_size=4))
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert time.process_time() - started < 10
+
+
+@pytest.mark.slow
+def test_many_pairs_are_no_error():
+    # More than are listed at a go: 20,000 Gaussians in each of 4096 tiles.
+    inputs = facing(20_000, 256, 256)
+    inputs["scales"][:] = 100.0
+    inputs["opacities"][:] = 0.625
+    colors, alphas, info = rasterization(**inputs, settings=RasterSettings(tile_size=4))
+    assert info["n_isects"] == 20_000 * 64 * 64
+    assert (alphas > 0.999).all()
+    assert torch.equal(colors, rasterization(**inputs).colors)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 //! One view from Gaussians to image and back: the stages in order.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use rayon::prelude::*;
 
 use crate::camera::Camera;
@@ -15,6 +17,10 @@ use crate::project::{Lens, ScreenInfo, Splat};
 use crate::real::Real;
 use crate::settings::{Limits, RasterSettings, RenderMode};
 use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, bin_tiles};
+
+/// (Gaussian, tile) pairs that are listed while projecting. With more, the rest is first only counted: should they be
+/// more than can be numbered, that is to be said before they fill the memory.
+const PATIENCE: usize = 1 << 26;
 
 /// Everything one image is made of.
 #[derive(Clone, Copy, Debug)]
@@ -96,28 +102,42 @@ impl<T: Real> Binned<T> {
             self.covers.resize_with(chunks, Cover::default);
         }
         let (lens, level) = (Lens::new(&view.camera, limits), SimdLevel::detect());
-        (
-            stale(&mut self.splats, n).par_chunks_mut(CHUNK),
-            self.covers[..chunks].par_iter_mut(),
-            screen.means2d.par_chunks_mut(CHUNK),
-            screen.depths.par_chunks_mut(CHUNK),
-            screen.radii.par_chunks_mut(CHUNK),
-        )
-            .into_par_iter()
-            .enumerate()
-            .for_each(|(chunk, (splats, cover, means2d, depths, radii))| {
-                let screen = ScreenInfo {
-                    means2d,
-                    depths,
-                    radii,
-                };
-                let out = ChunkSplats {
-                    splats,
-                    screen,
-                    cover,
-                };
-                levels::project(level, &view.gaussians, chunk * CHUNK, &lens, grid, wanted, out);
-            });
+        let ScreenInfo {
+            means2d,
+            depths,
+            radii,
+        } = screen;
+        for patience in [PATIENCE, usize::MAX] {
+            let pairs = AtomicUsize::new(0);
+            (
+                stale(&mut self.splats, n).par_chunks_mut(CHUNK),
+                self.covers[..chunks].par_iter_mut(),
+                means2d.par_chunks_mut(CHUNK),
+                depths.par_chunks_mut(CHUNK),
+                radii.par_chunks_mut(CHUNK),
+            )
+                .into_par_iter()
+                .enumerate()
+                .for_each(|(chunk, (splats, cover, means2d, depths, radii))| {
+                    cover.counting = pairs.load(Ordering::Relaxed) > patience;
+                    let screen = ScreenInfo {
+                        means2d,
+                        depths,
+                        radii,
+                    };
+                    let out = ChunkSplats {
+                        splats,
+                        screen,
+                        cover: &mut *cover,
+                    };
+                    levels::project(level, &view.gaussians, chunk * CHUNK, &lens, grid, wanted, out);
+                    pairs.fetch_add(cover.count(), Ordering::Relaxed);
+                });
+            let pairs = pairs.into_inner();
+            if pairs <= patience || u32::try_from(pairs).is_err() {
+                break;
+            }
+        }
     }
 
     /// Sorts the projected splats by depth and lists those of every tile.

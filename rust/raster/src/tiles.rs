@@ -186,6 +186,8 @@ pub(crate) struct Cover {
     /// Gaussian by Gaussian; what lies behind `end` is to be overwritten.
     tiles: Vec<u32>,
     end: usize,
+    /// Whether pairs are only counted, in `end`: there are too many to list before their number is known.
+    pub(crate) counting: bool,
     /// Where in `tiles` those of each Gaussian of the chunk begin, and where the last end.
     begins: Vec<u32>,
     /// Gaussians of the chunk that some pixel may see.
@@ -215,6 +217,11 @@ impl Cover {
     fn push(&mut self, owner: usize, first: u32, count: u32, wanted: Option<&[bool]>) {
         /// Tiles written at once, needed or not: how many are is hard for a branch to predict.
         const AT_ONCE: usize = 8;
+        if self.counting {
+            let tiles = first as usize..(first + count) as usize;
+            self.end += wanted.map_or(tiles.len(), |wanted| wanted[tiles].iter().filter(|&&w| w).count());
+            return;
+        }
         let end = self.end + count as usize;
         if self.tiles.len() < end + AT_ONCE {
             self.tiles.resize((end + AT_ONCE).max(2 * self.tiles.len()), 0);
@@ -244,6 +251,11 @@ impl Cover {
             last = last.max(*begin);
             *begin = last;
         }
+    }
+
+    /// How many (Gaussian, tile) pairs, listed or not.
+    pub(crate) fn count(&self) -> usize {
+        self.end
     }
 
     /// (Gaussian, tile) pairs of the chunk.
