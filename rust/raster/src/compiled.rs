@@ -9,6 +9,7 @@ use crate::composite::{Canvas, CompositeGradients, Cotangents, Scene, composite,
 use crate::error::RasterError;
 use crate::gaussians::first_not_finite;
 use crate::kernel::Channels;
+use crate::pool::Pooled;
 use crate::project::ScreenInfo;
 use crate::real::Real;
 use crate::render::{Binned, View, ViewGradients, project_view_vjp};
@@ -35,13 +36,17 @@ pub trait Compiled: Sized {
     ) -> Result<(), RasterError>
     where
         Self: Real;
-    fn composite(scene: &Scene<'_, Self>, colors: &mut [Self], alphas: &mut [Self]) -> Canvas<Self>;
+    fn composite(scene: &Scene<'_, Self>, colors: &mut [Self], alphas: &mut [Self]) -> Pooled<Canvas<Self>>
+    where
+        Self: Real;
     fn composite_vjp(
         scene: &Scene<'_, Self>,
         canvas: &Canvas<Self>,
         v: Cotangents<'_, Self>,
         absolute: bool,
-    ) -> CompositeGradients<Self>;
+    ) -> CompositeGradients<Self>
+    where
+        Self: Real;
     fn medians(scene: &Scene<'_, Self>, canvas: &Canvas<Self>) -> Vec<i32>;
     fn project_vjp(
         view: &View<'_, Self>,
@@ -86,7 +91,11 @@ macro_rules! compiled {
                 binned.bin(grid, scratch)
             }
 
-            fn composite(scene: &Scene<'_, Self>, colors: &mut [Self], alphas: &mut [Self]) -> Canvas<Self> {
+            fn composite(
+                scene: &Scene<'_, Self>,
+                colors: &mut [Self],
+                alphas: &mut [Self],
+            ) -> Pooled<Canvas<Self>> {
                 composite(scene, colors, alphas)
             }
 

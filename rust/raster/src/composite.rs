@@ -9,6 +9,7 @@ use crate::kernel::{
     ABSOLUTES, BLOCK, Channels, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_SIDE, MOMENTS, TileCotangents,
     TileImage, TilePlane, TileTask,
 };
+use crate::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::project::Splat;
 use crate::real::Real;
 use crate::settings::Limits;
@@ -35,12 +36,29 @@ pub(crate) struct Scene<'a, T> {
     pub(crate) grid: TileGrid,
     pub(crate) bins: &'a TileBins,
     pub(crate) splats: &'a [Splat<T>],
-    pub(crate) ids: &'a [u32],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) expected_depth: bool,
     pub(crate) background: Option<&'a [T]>,
     pub(crate) pixel_mask: Option<&'a [bool]>,
     pub(crate) limits: &'a Limits<T>,
+}
+
+impl<T> Default for Canvas<T> {
+    fn default() -> Self {
+        Self {
+            transmittance: Vec::new(),
+            end: Vec::new(),
+            masks: Vec::new(),
+            depths: Vec::new(),
+        }
+    }
+}
+
+impl<T: Real> Buffers for Canvas<T> {
+    fn bytes(&self) -> usize {
+        let lanes = [&self.transmittance, &self.end, &self.depths];
+        lanes.map(bytes_of).iter().sum::<usize>() + bytes_of(&self.masks)
+    }
 }
 
 impl<'a, T: Real> Scene<'a, T> {
@@ -50,7 +68,6 @@ impl<'a, T: Real> Scene<'a, T> {
             side: self.grid.tile_size / BLOCK,
             ranks: &self.bins.ranks[self.bins.offsets[tile] as usize..self.bins.offsets[tile + 1] as usize],
             splats: self.splats,
-            ids: self.ids,
             channels: self.channels,
             first: 0,
             limits: self.limits,
@@ -155,25 +172,25 @@ impl<'a, T: Real> Strip<'a, T> {
 }
 
 /// Composites every tile over the background into the image.
-pub(crate) fn composite<T: Real>(scene: &Scene<'_, T>, colors: &mut [T], alphas: &mut [T]) -> Canvas<T> {
+pub(crate) fn composite<T: Real>(
+    scene: &Scene<'_, T>,
+    colors: &mut [T],
+    alphas: &mut [T],
+) -> Pooled<Canvas<T>> {
     let grid = &scene.grid;
     let blocks = grid.len() * scene.blocks();
     let total = scene.channels.total;
-    let mut canvas = Canvas {
-        transmittance: vec![Lanes::ZERO; blocks],
-        end: vec![Lanes::ZERO; blocks],
-        masks: vec![0; scene.bins.ranks.len()],
-        depths: vec![Lanes::ZERO; if scene.expected_depth { blocks } else { 0 }],
-    };
+    let mut canvas = Pooled::<Canvas<T>>::take();
+    let out = &mut *canvas;
     let mut rest = Strip {
         tile: 0,
         tiles: grid.len(),
         colors: Default::default(),
         alphas: Default::default(),
-        transmittance: &mut canvas.transmittance,
-        end: &mut canvas.end,
-        depths: &mut canvas.depths,
-        masks: &mut canvas.masks,
+        transmittance: stale(&mut out.transmittance, blocks),
+        end: stale(&mut out.end, blocks),
+        depths: stale(&mut out.depths, if scene.expected_depth { blocks } else { 0 }),
+        masks: stale(&mut out.masks, scene.bins.ranks.len()),
     };
     let strips: Vec<Strip<'_, T>> = colors
         .chunks_mut(grid.tile_size * grid.width * total)
@@ -236,41 +253,54 @@ fn composite_tile<T: Real>(
             .copy_from_slice(&planes[(total - 1) * blocks..total * blocks]);
     }
     match total {
-        1 => write_tile::<T, 1>(scene, background, planes, &mut out),
-        3 => write_tile::<T, 3>(scene, background, planes, &mut out),
-        4 => write_tile::<T, 4>(scene, background, planes, &mut out),
-        _ => write_tile::<T, 0>(scene, background, planes, &mut out),
+        1 if !scene.expected_depth => write_colors::<T, 1>(scene, background, planes, &mut out),
+        3 if !scene.expected_depth => write_colors::<T, 3>(scene, background, planes, &mut out),
+        4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
+        _ => write_tile(scene, background, planes, &mut out),
     }
 }
 
-/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha. K is the number of
-/// channels if it is known.
-fn write_tile<T: Real, const K: usize>(
+/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.
+fn write_tile<T: Real>(scene: &Scene<'_, T>, background: &[T], planes: &[Lanes<T>], out: &mut Strip<'_, T>) {
+    let total = scene.channels.total;
+    let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
+    for (y, (colors, alphas)) in out.colors.iter_mut().zip(&mut out.alphas).enumerate() {
+        for (x, (values, alpha)) in colors.chunks_exact_mut(total).zip(alphas.iter_mut()).enumerate() {
+            let block = y / BLOCK * side + x / BLOCK;
+            let lane = y % BLOCK * BLOCK + x % BLOCK;
+            let transmittance = out.transmittance[block].0[lane];
+            for (channel, value) in values.iter_mut().enumerate() {
+                *value = planes[channel * blocks + block].0[lane] + transmittance * background[channel];
+            }
+            *alpha = T::ONE - transmittance;
+            if scene.expected_depth {
+                values[total - 1] = values[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
+            }
+        }
+    }
+}
+
+/// [`write_tile`] for the usual numbers of channels and no division, a row of a block at a time.
+fn write_colors<T: Real, const K: usize>(
     scene: &Scene<'_, T>,
     background: &[T],
     planes: &[Lanes<T>],
     out: &mut Strip<'_, T>,
 ) {
-    let total = if K > 0 { K } else { scene.channels.total };
     let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
+    let background: [T; K] = std::array::from_fn(|k| background[k]);
     for (y, (colors, alphas)) in out.colors.iter_mut().zip(&mut out.alphas).enumerate() {
-        for (column, (colors, alphas)) in colors
-            .chunks_mut(BLOCK * total)
-            .zip(alphas.chunks_mut(BLOCK))
-            .enumerate()
+        let (first, row) = (y / BLOCK * side, y % BLOCK);
+        let colors = colors.as_chunks_mut::<K>().0;
+        for (block, (colors, alphas)) in (first..).zip(colors.chunks_mut(BLOCK).zip(alphas.chunks_mut(BLOCK)))
         {
-            let block = y / BLOCK * side + column;
-            let lane = y % BLOCK * BLOCK;
-            let transmittance = &out.transmittance[block].0[lane..lane + BLOCK];
-            for (i, (values, alpha)) in colors.chunks_exact_mut(total).zip(alphas).enumerate() {
-                for channel in 0..total {
-                    values[channel] =
-                        planes[channel * blocks + block].0[lane + i] + transmittance[i] * background[channel];
+            let transmittance = out.transmittance[block].rows()[row];
+            let values: [[T; BLOCK]; K] = std::array::from_fn(|k| planes[k * blocks + block].rows()[row]);
+            for (i, (color, alpha)) in colors.iter_mut().zip(alphas).enumerate() {
+                for k in 0..K {
+                    color[k] = values[k][i] + transmittance[i] * background[k];
                 }
                 *alpha = T::ONE - transmittance[i];
-                if scene.expected_depth {
-                    values[total - 1] = values[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
-                }
             }
         }
     }
@@ -297,7 +327,7 @@ pub(crate) fn medians<T: Real>(scene: &Scene<'_, T>, canvas: &Canvas<T>) -> Vec<
                 let own = &mut ids[pixel - row * rows..][..count];
                 for (id, place) in own.iter_mut().zip(&places[block].0[lane..]) {
                     if let Some(place) = place.past_ordinal().checked_sub(1) {
-                        *id = scene.ids[task.ranks[place as usize] as usize] as i32;
+                        *id = task.ranks[place as usize] as i32;
                     }
                 }
             });
@@ -314,11 +344,32 @@ pub(crate) struct Cotangents<'a, T> {
     pub(crate) alphas: &'a [T],
 }
 
+/// `MOMENTS` + channels values per entry of `TileBins::ranks`, and `ABSOLUTES` if asked for.
+#[derive(Debug)]
+pub(crate) struct Slots<T>(Vec<T>);
+
+impl<T> Slots<T> {
+    pub(crate) fn values(&self) -> &[T] {
+        &self.0
+    }
+}
+
+impl<T> Default for Slots<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
+
+impl<T: Real> Buffers for Slots<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.0)
+    }
+}
+
 /// What the compositor's vjp yields.
 #[derive(Debug)]
-pub(crate) struct CompositeGradients<T> {
-    /// `MOMENTS` + channels values per entry of `TileBins::ranks`, and `ABSOLUTES` if asked for.
-    pub(crate) slots: Vec<T>,
+pub(crate) struct CompositeGradients<T: Real> {
+    pub(crate) slots: Pooled<Slots<T>>,
     pub(crate) background: Vec<T>,
     /// Tiles whose incoming gradient was zero.
     pub(crate) tiles_skipped: usize,
@@ -343,11 +394,12 @@ pub(crate) fn composite_vjp<T: Real>(
     let blocks = scene.blocks();
     let total = scene.channels.total;
     let stride = MOMENTS + total + if absolute { ABSOLUTES } else { 0 };
-    let mut slots = vec![T::ZERO; scene.bins.ranks.len() * stride];
+    let mut slots = Pooled::<Slots<T>>::take();
+    let values = stale(&mut slots.0, scene.bins.ranks.len() * stride);
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     (
-        pieces_by_tile(&mut slots, &scene.bins.offsets, stride),
+        pieces_by_tile(values, &scene.bins.offsets, stride),
         backgrounds.par_chunks_mut(total),
     )
         .into_par_iter()
@@ -367,7 +419,9 @@ pub(crate) fn composite_vjp<T: Real>(
                         v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
                     }
                 }
-                if any && !task.ranks.is_empty() {
+                if !any {
+                    clear(slots, stride, task.first, total);
+                } else if !task.ranks.is_empty() {
                     skipped = false;
                     let cotangents = TileCotangents {
                         transmittance,
@@ -395,6 +449,17 @@ pub(crate) fn composite_vjp<T: Real>(
         slots,
         background,
         tiles_skipped: tiles_skipped.into_inner(),
+    }
+}
+
+/// Zeroes what a kernel would have written for the channels of the group that starts with `first`.
+fn clear<T: Real>(slots: &mut [T], stride: usize, first: usize, total: usize) {
+    if first == 0 {
+        slots.fill(T::ZERO);
+        return;
+    }
+    for slot in slots.chunks_exact_mut(stride) {
+        slot[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
     }
 }
 

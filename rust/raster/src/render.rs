@@ -43,8 +43,6 @@ pub(crate) struct Image<'a, T> {
 pub(crate) struct Binned<T> {
     /// By Gaussian; anything for one that no pixel sees.
     pub(crate) splats: Vec<Splat<T>>,
-    /// 0, 1, 2, … as far as any view needed: the Gaussian of each splat.
-    ids: Vec<u32>,
     /// By chunk of Gaussians.
     covers: Vec<Cover>,
     pub(crate) bins: TileBins,
@@ -54,7 +52,6 @@ impl<T> Default for Binned<T> {
     fn default() -> Self {
         Self {
             splats: Vec::new(),
-            ids: Vec::new(),
             covers: Vec::new(),
             bins: TileBins::default(),
         }
@@ -63,10 +60,7 @@ impl<T> Default for Binned<T> {
 
 impl<T: Real> Buffers for Binned<T> {
     fn bytes(&self) -> usize {
-        bytes_of(&self.splats)
-            + bytes_of(&self.ids)
-            + self.covers.iter().map(Cover::bytes).sum::<usize>()
-            + self.bins.bytes()
+        bytes_of(&self.splats) + self.covers.iter().map(Cover::bytes).sum::<usize>() + self.bins.bytes()
     }
 }
 
@@ -81,11 +75,6 @@ impl<T: Real> Binned<T> {
         &self.covers[..self.splats.len().div_ceil(CHUNK)]
     }
 
-    /// The Gaussian of each splat.
-    pub(crate) fn ids(&self) -> &[u32] {
-        &self.ids[..self.splats.len()]
-    }
-
     /// Projects the Gaussians of a view and finds the tiles that each reaches.
     pub(crate) fn project(
         &mut self,
@@ -97,7 +86,6 @@ impl<T: Real> Binned<T> {
     ) {
         let n = view.gaussians.len();
         let chunks = n.div_ceil(CHUNK);
-        self.ids.extend(self.ids.len() as u32..n as u32);
         if self.covers.len() < chunks {
             self.covers.resize_with(chunks, Cover::default);
         }
@@ -154,7 +142,7 @@ pub(crate) struct ViewState<T: Real> {
     grid: TileGrid,
     limits: Limits<T>,
     binned: Pooled<Binned<T>>,
-    canvas: Canvas<T>,
+    canvas: Pooled<Canvas<T>>,
 }
 
 impl<T: Real> ViewState<T> {
@@ -168,7 +156,6 @@ impl<T: Real> ViewState<T> {
             grid: self.grid,
             bins: &self.binned.bins,
             splats: &self.binned.splats,
-            ids: self.binned.ids(),
             // Only whom light reaches is asked, not with which colour.
             channels: Channels {
                 colors: &[],
@@ -238,7 +225,6 @@ pub(crate) fn scene<'a, T: Real>(
         grid: TileGrid::new(view.camera.width, view.camera.height, limits.tile_size),
         bins: &binned.bins,
         splats: &binned.splats,
-        ids: binned.ids(),
         channels: channels_of(&view.gaussians, mode),
         expected_depth: mode.expects_depth(),
         background: view.background,
@@ -388,7 +374,14 @@ pub(crate) fn render_view_vjp<T: Real>(
     for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
         *sum += v;
     }
-    T::project_vjp(view, limits, &state.binned, scene.channels, &gradients.slots, out);
+    T::project_vjp(
+        view,
+        limits,
+        &state.binned,
+        scene.channels,
+        gradients.slots.values(),
+        out,
+    );
     gradients.tiles_skipped
 }
 

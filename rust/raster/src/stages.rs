@@ -27,7 +27,7 @@ pub struct Stages<'a, T: Real> {
     scratch: Pooled<BinScratch<T>>,
     colors: Vec<T>,
     alphas: Vec<T>,
-    canvas: Canvas<T>,
+    canvas: Pooled<Canvas<T>>,
     gradients: CompositeGradients<T>,
 }
 
@@ -144,7 +144,7 @@ impl<'a, T: Real> Stages<'a, T> {
             &self.limits,
             &self.binned,
             channels,
-            &self.gradients.slots,
+            self.gradients.slots.values(),
             grads.slices(),
         );
         grads

@@ -1,8 +1,8 @@
 //! One tile, back to front, gradients.
 
 use super::{
-    ABSOLUTES, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane, TileTask,
-    WORD, falloff,
+    ABSOLUTES, AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane,
+    TileTask, WORD, falloff,
 };
 use crate::real::Real;
 use crate::vector::Vector;
@@ -154,6 +154,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
     for batch in (0..task.ranks.len()).step_by(WORD).rev() {
         let masks = &pixels.masks[batch..task.ranks.len().min(batch + WORD)];
         for (i, mask) in masks.iter().enumerate() {
+            task.prefetch(batch + i + AHEAD);
             if mask & (active | sleeping) != 0 {
                 entries[i] = Entry::load(task, batch + i);
             }

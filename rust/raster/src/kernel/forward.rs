@@ -1,7 +1,7 @@
 //! One tile, front to back.
 
 use super::reach::BlockCentres;
-use super::{Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, WORD, falloff};
+use super::{AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, WORD, falloff};
 use crate::real::Real;
 use crate::vector::{Vector, transpose_bits};
 
@@ -94,6 +94,7 @@ pub(crate) fn forward_tile<V: Vector, const K: usize>(
         let size = BATCH.min(task.ranks.len() - batch);
         let mut masks = [[0u16; WORD]; BATCH / WORD];
         for i in 0..size {
+            task.prefetch(batch + i + AHEAD);
             let splat = &task.splats[task.ranks[batch + i] as usize];
             masks[i / WORD][i % WORD] = block_centres.reached::<V>(splat, task.centre(splat)) & taking;
             entries[i] = Entry::load(task, batch + i);

@@ -21,7 +21,7 @@ pub(crate) use median::median_tile;
 use crate::project::Splat;
 use crate::real::Real;
 use crate::settings::Limits;
-use crate::vector::Vector;
+use crate::vector::{Vector, prefetch};
 
 /// Pixels in a block.
 pub(crate) const LANES: usize = 16;
@@ -39,15 +39,29 @@ pub(crate) const ABSOLUTES: usize = 2;
 pub(crate) const MAX_CHANNELS: usize = 8;
 /// Splats whose block masks make a word per block.
 const WORD: usize = 64;
+/// Splats that are asked for ahead of the one being loaded.
+const AHEAD: usize = 12;
 
 /// One value per pixel of a block, where a vector register finds it: a load that straddles two cache lines is slow.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(64))]
 pub(crate) struct Lanes<T>(pub(crate) [T; LANES]);
 
+impl<T: Real> Default for Lanes<T> {
+    fn default() -> Self {
+        Self::ZERO
+    }
+}
+
 impl<T: Real> Lanes<T> {
     pub(crate) const ZERO: Self = Self([T::ZERO; LANES]);
     pub(crate) const ONE: Self = Self([T::ONE; LANES]);
+
+    /// By row of the block.
+    #[inline(always)]
+    pub(crate) fn rows(&self) -> &[[T; BLOCK]] {
+        self.0.as_chunks().0
+    }
 
     #[inline(always)]
     fn get<V: Vector<Scalar = T>>(&self, first: usize) -> V {
@@ -82,11 +96,10 @@ pub(crate) struct TileTask<'a, T> {
     pub(crate) origin: (usize, usize),
     /// Blocks along a side.
     pub(crate) side: usize,
-    /// Depth ranks of the tile's splats, front to back.
+    /// The Gaussians of the tile's list, front to back.
     pub(crate) ranks: &'a [u32],
+    /// By Gaussian.
     pub(crate) splats: &'a [Splat<T>],
-    /// Gaussian of each rank.
-    pub(crate) ids: &'a [u32],
     pub(crate) channels: Channels<'a, T>,
     /// First of the channels handled now.
     pub(crate) first: usize,
@@ -107,6 +120,18 @@ impl<T: Real> TileTask<'_, T> {
     fn first_centre(&self) -> [T; 2] {
         let first = |first: usize| T::of((first % MAX_SIDE) as f64 + 0.5 - (MAX_SIDE / 2) as f64);
         [first(self.origin.0), first(self.origin.1)]
+    }
+
+    /// Asks for the memory that a place of the list will be loaded from: Gaussians lie in no order of a tile's.
+    #[inline(always)]
+    fn prefetch(&self, index: usize) {
+        if let Some(&rank) = self.ranks.get(index) {
+            prefetch(self.splats, rank as usize);
+            prefetch(
+                self.channels.colors,
+                rank as usize * self.channels.stride + self.first,
+            );
+        }
     }
 
     /// Centre of a splat from the tile's anchor.
@@ -162,7 +187,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
         let [x, y] = task.centre(splat);
         let mut values = [T::ZERO; K];
         let c = &task.channels;
-        let start = task.ids[rank] as usize * c.stride + task.first;
+        let start = rank * c.stride + task.first;
         if task.first + K <= c.colored {
             values.copy_from_slice(&c.colors[start..start + K]);
         } else {
@@ -199,8 +224,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
 /// 2^−(u² + v²)
 #[inline(always)]
 fn falloff<V: Vector>(u: V, v: V) -> V {
-    let negative = V::splat(V::Scalar::ZERO).minus(v.times(v));
-    u.times_from(u, negative).exp2()
+    u.minus_times_minus(u, v.times(v)).exp2()
 }
 
 /// Pixel centres of every block from the tile's anchor.

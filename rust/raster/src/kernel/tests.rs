@@ -67,7 +67,6 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         side,
         ranks: &all,
         splats: &splats,
-        ids: &all,
         channels: Channels {
             colors: &colors,
             stride: channels,

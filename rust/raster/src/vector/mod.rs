@@ -43,6 +43,8 @@ pub trait Vector: Copy {
     fn times_minus(self, a: Self, b: Self) -> Self;
     /// b − self · a
     fn times_from(self, a: Self, b: Self) -> Self;
+    /// −self · a − b
+    fn minus_times_minus(self, a: Self, b: Self) -> Self;
     fn min(self, other: Self) -> Self;
     fn max(self, other: Self) -> Self;
     /// 2^x for x ≤ 0; zero, or next to it, below the range of normal numbers.
@@ -146,6 +148,17 @@ fn polynomial<V: Vector, const N: usize>(x: V, coefficients: &[V::Scalar; N]) ->
         sum = sum.times_plus(x, V::splat(coefficients[k]));
     }
     sum
+}
+
+/// Starts to bring a value into the first cache; none if there is no such value.
+#[inline(always)]
+pub(crate) fn prefetch<U>(values: &[U], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(value) = values.get(index) {
+        x86::prefetch(value);
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (values, index);
 }
 
 /// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word.

@@ -72,6 +72,10 @@ macro_rules! neon {
                 Self(op!($fms(b.0, self.0, a.0)))
             }
             #[inline(always)]
+            fn minus_times_minus(self, a: Self, b: Self) -> Self {
+                Self(op!($neg($fma(b.0, self.0, a.0))))
+            }
+            #[inline(always)]
             fn min(self, other: Self) -> Self {
                 Self(op!($min(self.0, other.0)))
             }

@@ -61,6 +61,10 @@ macro_rules! array {
                 b.minus(self.times(a))
             }
             #[inline(always)]
+            fn minus_times_minus(self, a: Self, b: Self) -> Self {
+                Self::splat(0.0).minus(self.times(a).plus(b))
+            }
+            #[inline(always)]
             fn min(self, other: Self) -> Self {
                 self.map2(other, |a, b| if a < b { a } else { b })
             }

@@ -64,6 +64,7 @@ fn arithmetic<V: Vector>() {
     expect(a.times_plus(b, c), &|a, b| a * b + 0.25);
     expect(a.times_minus(b, c), &|a, b| a * b - 0.25);
     expect(a.times_from(b, c), &|a, b| 0.25 - a * b);
+    expect(a.minus_times_minus(b, c), &|a, b| -(a * b) - 0.25);
     expect(a.min(b), &f64::min);
     expect(a.max(b), &f64::max);
     expect(a.select(a.above(b), c), &|a, b| if a > b { a } else { 0.25 });

@@ -68,7 +68,7 @@ macro_rules! divided {
 }
 
 macro_rules! fused {
-    ($fmadd:ident, $fmsub:ident, $fnmadd:ident) => {
+    ($fmadd:ident, $fmsub:ident, $fnmadd:ident, $fnmsub:ident) => {
         #[inline(always)]
         fn times_plus(self, a: Self, b: Self) -> Self {
             Self(op!($fmadd(self.0, a.0, b.0)))
@@ -80,6 +80,10 @@ macro_rules! fused {
         #[inline(always)]
         fn times_from(self, a: Self, b: Self) -> Self {
             Self(op!($fnmadd(self.0, a.0, b.0)))
+        }
+        #[inline(always)]
+        fn minus_times_minus(self, a: Self, b: Self) -> Self {
+            Self(op!($fnmsub(self.0, a.0, b.0)))
         }
     };
 }
@@ -98,6 +102,10 @@ macro_rules! separate {
         #[inline(always)]
         fn times_from(self, a: Self, b: Self) -> Self {
             b.minus(self.times(a))
+        }
+        #[inline(always)]
+        fn minus_times_minus(self, a: Self, b: Self) -> Self {
+            Self::splat(0.0).minus(self.times(a).plus(b))
         }
     };
 }
@@ -352,7 +360,12 @@ impl Vector for F32x8 {
         _mm256_max_ps
     );
     divided!(_mm256_div_ps);
-    fused!(_mm256_fmadd_ps, _mm256_fmsub_ps, _mm256_fnmadd_ps);
+    fused!(
+        _mm256_fmadd_ps,
+        _mm256_fmsub_ps,
+        _mm256_fnmadd_ps,
+        _mm256_fnmsub_ps
+    );
     exp2_by_bits!(
         EXP2_F32,
         -126.0,
@@ -416,7 +429,12 @@ impl Vector for F64x4 {
         _mm256_max_pd
     );
     divided!(_mm256_div_pd);
-    fused!(_mm256_fmadd_pd, _mm256_fmsub_pd, _mm256_fnmadd_pd);
+    fused!(
+        _mm256_fmadd_pd,
+        _mm256_fmsub_pd,
+        _mm256_fnmadd_pd,
+        _mm256_fnmsub_pd
+    );
     exp2_by_bits!(
         EXP2_F64,
         -1022.0,
@@ -493,7 +511,12 @@ impl Vector for F32x16 {
         let quotient = self.times(reciprocal);
         quotient.times_from(other, self).times_plus(reciprocal, quotient)
     }
-    fused!(_mm512_fmadd_ps, _mm512_fmsub_ps, _mm512_fnmadd_ps);
+    fused!(
+        _mm512_fmadd_ps,
+        _mm512_fmsub_ps,
+        _mm512_fnmadd_ps,
+        _mm512_fnmsub_ps
+    );
     masks512!(
         __mmask16,
         _mm512_cmp_ps_mask,
@@ -566,7 +589,12 @@ impl Vector for F64x8 {
         _mm512_max_pd
     );
     divided!(_mm512_div_pd);
-    fused!(_mm512_fmadd_pd, _mm512_fmsub_pd, _mm512_fnmadd_pd);
+    fused!(
+        _mm512_fmadd_pd,
+        _mm512_fmsub_pd,
+        _mm512_fnmadd_pd,
+        _mm512_fnmsub_pd
+    );
     masks512!(
         __mmask8,
         _mm512_cmp_pd_mask,
@@ -584,6 +612,11 @@ impl Vector for F64x8 {
         _mm512_add_epi64
     );
     plain_sums!(f64, 8);
+}
+
+#[inline(always)]
+pub(super) fn prefetch<U>(value: &U) {
+    op!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()));
 }
 
 /// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word: 16 masks at a time, their bytes apart, a bit per step.
