@@ -5,7 +5,7 @@
 //! chunks do not depend on the number of threads.
 
 use crate::gaussians::Gaussians;
-use crate::project::{GaussianGradient, Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
+use crate::project::{Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
 use crate::real::Real;
 use crate::tiles::{Cover, Cutter, Ellipse, TileGrid, padded_reach, pixel_range};
 
@@ -250,7 +250,8 @@ pub(crate) fn is_sound<T: Real, const N: usize>(values: [T; N]) -> bool {
 }
 
 /// The vjp of [`project_chunk`], from splats to Gaussians and camera. A Gaussian whose gradient is beyond the scalar's
-/// range has none: one that stands on the camera must not spoil the camera's gradient, nor an optimiser's averages.
+/// range has none, and gives the camera none: one that stands on the camera must not spoil the camera's gradient, nor
+/// an optimiser's averages.
 #[inline(always)]
 pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
     gaussians: &Gaussians<'_, T>,
@@ -275,20 +276,20 @@ pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
             second: [huu, huv, hvv],
             depth,
         };
-        let mut v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
+        let v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
         // NaN that came in stays, so that it is noticed.
-        if !is_sound(v.values()) & is_sound(chunk.moments.map(|column| column[lane])) {
-            v = GaussianGradient::default();
+        let poisoned = !is_sound([h, hu, hv, huu, huv, hvv, depth]);
+        let ([m0, m1, m2], [q0, q1, q2, q3], [s0, s1, s2]) = (v.mean, v.quat, v.scale);
+        let own = [m0, m1, m2, q0, q1, q2, q3, s0, s1, s2, v.opacity];
+        let kept = is_sound(own) | poisoned;
+        for k in 0..11 {
+            out[k][lane] = if kept { own[k] } else { T::ZERO };
         }
-        [out[0][lane], out[1][lane], out[2][lane]] = v.mean;
-        [out[3][lane], out[4][lane], out[5][lane], out[6][lane]] = v.quat;
-        [out[7][lane], out[8][lane], out[9][lane]] = v.scale;
-        out[10][lane] = v.opacity;
         if CAMERA {
-            for r in 0..3 {
-                for c in 0..4 {
-                    viewmats[4 * r + c][lane] = v.viewmat[r][c];
-                }
+            let [v0, v1, v2] = v.viewmat;
+            let kept = kept & (is_sound(v0) & is_sound(v1) & is_sound(v2) | poisoned);
+            for k in 0..12 {
+                viewmats[k][lane] = if kept { v.viewmat[k / 4][k % 4] } else { T::ZERO };
             }
         }
     }

@@ -228,47 +228,12 @@ pub(crate) struct SplatGradient<T> {
 }
 
 /// Gradients of one view for one Gaussian; the last is that of the world-to-camera matrix, rows of [R | t].
-#[derive(Clone, Copy, Default)]
 pub(crate) struct GaussianGradient<T> {
     pub(crate) mean: Vec3<T>,
     pub(crate) quat: [T; 4],
     pub(crate) scale: Vec3<T>,
     pub(crate) opacity: T,
     pub(crate) viewmat: [[T; 4]; 3],
-}
-
-impl<T: Real> GaussianGradient<T> {
-    /// All of them.
-    #[inline(always)]
-    pub(crate) fn values(&self) -> [T; 23] {
-        let ([m0, m1, m2], [q0, q1, q2, q3], [s0, s1, s2]) = (self.mean, self.quat, self.scale);
-        let [[v0, v1, v2, v3], [v4, v5, v6, v7], [v8, v9, v10, v11]] = self.viewmat;
-        [
-            m0,
-            m1,
-            m2,
-            q0,
-            q1,
-            q2,
-            q3,
-            s0,
-            s1,
-            s2,
-            self.opacity,
-            v0,
-            v1,
-            v2,
-            v3,
-            v4,
-            v5,
-            v6,
-            v7,
-            v8,
-            v9,
-            v10,
-            v11,
-        ]
-    }
 }
 
 /// The vjp of [`splat`] for a visible Gaussian.
