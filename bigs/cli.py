@@ -73,6 +73,7 @@ def reconstruct(
     resume: bool = False,
     config: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     threads: int = 0,
 ) -> None:
     """Reconstruct the hands and the object of a clip into a run folder.
@@ -86,17 +87,21 @@ def reconstruct(
         resume: continue an interrupted run in the same folder.
         config: a config.yaml of an earlier run, instead of a preset.
         set: change one setting, as path=value (raster.eps2d=0.2, stages.hands-fine.steps=50); repeatable.
+        without: leave out one ingredient (share, smooth, contact, lighting, ...) or loss term; repeatable.
         threads: CPU threads; 0 takes all.
     """
     _use_threads(threads)
     from bigs.commands.progress import progress_listener
     from bigs.commands.reconstruct import reconstruct as run
+    from bigs.train.switches import without_all
 
-    settings = _config(preset, config, set)
+    settings, unused = without_all(_config(preset, config, set), without)
     with progress_listener(_err, settings) as listen:
         outcome = run(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen
         )
+    for name in unused:
+        _out.print(f"--without {name}: this plan has nothing of it", markup=False, highlight=False)
     _show(outcome)
 
 

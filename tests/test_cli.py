@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,10 @@ import pytest
 from command_line import Answer, assert_refused, run_bigs
 
 from bigs.checks import InputError
+from bigs.commands.reconstruct import Outcome
+from bigs.train.config import RunConfig
+from bigs.train.fit import FitReport
+from bigs.train.presets import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -42,6 +47,7 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         ("reconstruct CLIP --out OUT --bogus 3", ["--bogus"]),
         ("reconstruct CLIP --out OUT --preset turbo", ["turbo", "--preset", "smoke"]),
         ("reconstruct CLIP", ["--out"]),
+        ("reconstruct CLIP --out OUT --without turbo", ["--without", "share", "contact", "ssim", "'turbo'"]),
         ("reconstruct CLIP --out OUT --threads two", ["--threads"]),
         ("reconstruct CLIP --out OUT --threads -1", ["--threads", "expected 0", "found -1"]),
         ("frobnicate", ["frobnicate"]),
@@ -59,6 +65,26 @@ def test_arguments_that_are_none(
     assert_refused(answer)
     assert all(word in answer.err for word in words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ingredients_are_left_out(
+    call: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[RunConfig] = []
+
+    def run(clip: Path, out: Path, config: RunConfig, **_: Any) -> Outcome:
+        given.append(config)
+        return Outcome(out, [("score", "unit", "result")], FitReport(), 0.0)
+
+    monkeypatch.setattr("bigs.commands.reconstruct.reconstruct", run)
+    options = ["--preset", "fast", "--set", "seed=3", "--without", "share", "--without", "offset"]
+    answer = call("reconstruct", tmp_path, "--out", tmp_path / "out", *options)
+    assert answer.code == 0, answer.err
+    fast = replace(PRESETS["fast"], seed=3)
+    assert given == [replace(fast, hand=replace(fast.hand, shared=False))]
+    # No preset uses the term offset.
+    assert "--without offset: this plan has nothing of it" in answer.out
+    assert "--without share" not in answer.out
 
 
 @pytest.mark.parametrize(

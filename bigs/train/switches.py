@@ -1,0 +1,186 @@
+"""Every ingredient of the method under a name by which a configuration can be left without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+from bigs.checks import InputError
+from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage, Stage
+from bigs.train.terms import IMAGE_TERMS, TERMS
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An ingredient that a run can do without."""
+
+    text: str  # what is missing then
+    off: Callable[[RunConfig], RunConfig]
+
+
+def without(config: RunConfig, what: str) -> RunConfig:
+    """The configuration with one ingredient left out; equal to `config` where it had no part in the plan.
+
+    Args:
+        config: any plan.
+        what: a name in `SWITCHES`.
+
+    Raises:
+        InputError: there is no such ingredient.
+    """
+    if what not in SWITCHES:
+        raise InputError(f"--without: expected names out of {', '.join(SWITCHES)}, found {what!r}")
+    return SWITCHES[what].off(config)
+
+
+def without_all(config: RunConfig, names: Iterable[str]) -> tuple[RunConfig, list[str]]:
+    """The configuration with several ingredients left out, and those among `names` that it did not have.
+
+    Raises:
+        InputError: as `without`, or nothing is left to do.
+    """
+    unused = []
+    for name in names:
+        less = without(config, name)
+        if less == config:
+            unused.append(name)
+        if not any(isinstance(stage, OptimizeStage) for stage in less.stages):
+            raise InputError(f"--without {name}: expected a stage that is left to run, found none")
+        config = less
+    return config, unused
+
+
+def _terms(*names: str) -> Callable[[RunConfig], RunConfig]:
+    """Leave out loss terms."""
+    return lambda config: _keep(config, lambda stage: replace(stage, weights=_less(stage.weights, names)))
+
+
+def _groups(*names: str) -> Callable[[RunConfig], RunConfig]:
+    """Freeze parameters."""
+    return lambda config: _keep(config, lambda stage: replace(stage, lrs=_less(stage.lrs, names)))
+
+
+def _less(values: dict[str, float], names: Iterable[str]) -> dict[str, float]:
+    return {name: value for name, value in values.items() if name not in names}
+
+
+def _keep(
+    config: RunConfig,
+    change: Callable[[OptimizeStage], OptimizeStage] = lambda stage: stage,
+    leave_out: type[Stage] | None = None,
+) -> RunConfig:
+    """The same with changed stages, without those of a kind and those that have nothing left to do."""
+    stages = [
+        change(stage) if isinstance(stage, OptimizeStage) else stage
+        for stage in config.stages
+        if leave_out is None or not isinstance(stage, leave_out)
+    ]
+    idle = [
+        stage for stage in stages if isinstance(stage, OptimizeStage) and not (stage.lrs and stage.weights)
+    ]
+    return replace(config, stages=tuple(stage for stage in stages if stage not in idle))
+
+
+def _all_of(*steps: Callable[[RunConfig], RunConfig]) -> Callable[[RunConfig], RunConfig]:
+    def off(config: RunConfig) -> RunConfig:
+        for step in steps:
+            config = step(config)
+        return config
+
+    return off
+
+
+def _smooth(config: RunConfig) -> RunConfig:
+    return replace(config, initial=replace(config.initial, smooth_hands=0.0))
+
+
+def _object_smooth(config: RunConfig) -> RunConfig:
+    return replace(config, initial=replace(config.initial, smooth_object=0.0))
+
+
+def _scale_search(config: RunConfig) -> RunConfig:
+    return _keep(config, leave_out=ScaleSearchStage)
+
+
+def _search_labels(config: RunConfig) -> RunConfig:
+    return replace(
+        config,
+        stages=tuple(
+            replace(stage, labels_weight=0.0) if isinstance(stage, ScaleSearchStage) else stage
+            for stage in config.stages
+        ),
+    )
+
+
+def _pyramid(config: RunConfig) -> RunConfig:
+    sizes = [stage.image_size for stage in config.stages if isinstance(stage, OptimizeStage)]
+    finest = 0 if 0 in sizes else max(sizes, default=0)
+    return _keep(config, lambda stage: replace(stage, image_size=finest))
+
+
+# Parameters of single frames, as the paper's P^t has them, not what all frames or those of a grasp share.
+_FRAME_POSES = (
+    *(f"hand.{name}" for name in ("orient", "pose", "ray", "depth")),
+    *(f"object.{name}" for name in ("orient", "ray", "depth")),
+)
+_GRASP_GROUPS = ("hand.grasp_orient", "hand.grasp_pose", "hand.grasp_position")
+
+_INGREDIENTS = {
+    "share": Switch(
+        "one canonical hand and one shape for both sides",
+        lambda config: replace(config, hand=replace(config.hand, shared=False)),
+    ),
+    "smooth": Switch(
+        "hands' motion: the smoothing of their estimates, L_smt, and acceleration of the joints",
+        _all_of(_terms("smooth", "acceleration"), _smooth),
+    ),
+    "contact": Switch(
+        "contact and penetration, and the search of the object's size that they decide",
+        _all_of(_terms("contact", "penetration"), _scale_search),
+    ),
+    "frame_poses": Switch("residuals of the poses of single frames", _groups(*_FRAME_POSES)),
+    "object_smooth": Switch(
+        "the object's motion: the smoothing of its estimates, and acceleration",
+        _all_of(_terms("object_acceleration"), _object_smooth),
+    ),
+    "scale_search": Switch("the search of the object's size", _scale_search),
+    "grasps": Switch(
+        "grasps, in which the object carries a hand",
+        _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS)),
+    ),
+    "lighting": Switch(
+        "light and shade",
+        _all_of(
+            lambda config: replace(config, lighting=False),
+            _terms("shade_prior"),
+            _groups("scene.light", "scene.shade"),
+        ),
+    ),
+    "labels": Switch(
+        "who hides whom: the label term, also in the search of the object's size",
+        _all_of(_terms("labels"), _search_labels),
+    ),
+    "pose_priors": Switch(
+        "the pull of poses and shape to their estimates",
+        _terms("orient_prior", "pose_prior", "betas_prior", "object_prior"),
+    ),
+    "hand_geometry": Switch(
+        "offset, rotation and scale of the hand's Gaussians by the field",
+        _all_of(
+            lambda config: replace(config, hand=replace(config.hand, learn_geometry=False)),
+            _groups("hand.geometry"),
+        ),
+    ),
+    "split": Switch("the object's split into finer Gaussians", lambda c: _keep(c, leave_out=SplitStage)),
+    "pyramid": Switch("coarse images before fine ones", _pyramid),
+    "stopping": Switch(
+        "early stopping", lambda config: _keep(config, lambda stage: replace(stage, stop_patience=0))
+    ),
+}
+
+_TERM_NAMES = dict.fromkeys(name for terms in (*IMAGE_TERMS.values(), TERMS) for name in terms)
+
+# What `--without` accepts: ingredients of several parts, then every other loss term under its own name.
+SWITCHES: dict[str, Switch] = _INGREDIENTS | {
+    name: Switch(f"the loss term {name}", _terms(name)) for name in _TERM_NAMES if name not in _INGREDIENTS
+}
