@@ -100,12 +100,13 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
         (opacities[lane], reaches[lane]) = (s.opacity, s.reach);
         [rxs[lane], rys[lane]] = o.radii;
-        let [ceil_x, ceil_y] = o.radii.map(|r| r.lesser(most).ceiling());
-        (ceil_xs[lane], ceil_ys[lane]) = (ceil_x, ceil_y);
+        ceil_xs[lane] = o.radii[0].lesser(most).ceiling();
+        ceil_ys[lane] = o.radii[1].lesser(most).ceiling();
         seen[lane] = u32::from(o.visible);
 
         let reach = padded_reach(s.reach);
-        let [half_width, half_height] = o.deviations.map(|deviation| extent(reach) * deviation);
+        let extent = extent(reach);
+        let (half_width, half_height) = (extent * o.deviations[0], extent * o.deviations[1]);
         padded[lane] = reach;
         inverses[lane] = T::ONE / s.w11;
         slopes[lane] = o.slope;
@@ -269,7 +270,8 @@ pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
     let (moments, out) = (&chunk.moments, &mut chunk.gaussians);
     for lane in 0..whole_vectors(len) {
         let (mean, quat, scale, opacity) = columns.get(lane);
-        let [h, hu, hv, huu, huv, hvv, depth] = [0, 1, 2, 3, 4, 5, 6].map(|m| moments[m][lane]);
+        let m = |k: usize| moments[k][lane];
+        let [h, hu, hv, huu, huv, hvv, depth] = [m(0), m(1), m(2), m(3), m(4), m(5), m(6)];
         let v = SplatGradient {
             h,
             first: [hu, hv],

@@ -8,6 +8,12 @@ use crate::real::Real;
 pub(crate) type Vec3<T> = [T; 3];
 pub(crate) type Mat3<T> = [[T; 3]; 3];
 
+/// Three values. `array::map` is not always inlined into large functions, and a call keeps a loop from vectorising.
+#[inline(always)]
+pub(crate) fn three<U>(mut f: impl FnMut(usize) -> U) -> [U; 3] {
+    [f(0), f(1), f(2)]
+}
+
 #[inline(always)]
 pub(crate) fn dot<T: Real>(a: Vec3<T>, b: Vec3<T>) -> T {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -31,7 +37,7 @@ pub(crate) fn apply<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
 /// The transposed matrix times the vector.
 #[inline(always)]
 pub(crate) fn apply_transposed<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
-    [0, 1, 2].map(|j| m[0][j] * v[0] + m[1][j] * v[1] + m[2][j] * v[2])
+    three(|j| m[0][j] * v[0] + m[1][j] * v[1] + m[2][j] * v[2])
 }
 
 /// A normalised quaternion and the reciprocal of the length it had; (0, 0, 0, 0) for one without direction.
@@ -44,10 +50,13 @@ pub(crate) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T) {
         .greater(q[2].abs().greater(q[3].abs()));
     let directed = largest >= T::TINY;
     let shrink = T::ONE / largest.greater(T::TINY);
-    let r = q.map(|v| v * shrink);
+    let r = [q[0] * shrink, q[1] * shrink, q[2] * shrink, q[3] * shrink];
     let length = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]).sqrt();
     let inverse = if directed { T::ONE / length } else { T::ZERO };
-    (r.map(|v| v * inverse), inverse * shrink)
+    (
+        [r[0] * inverse, r[1] * inverse, r[2] * inverse, r[3] * inverse],
+        inverse * shrink,
+    )
 }
 
 /// Rotation matrix of a unit quaternion (w, x, y, z); the identity for (0, 0, 0, 0).
@@ -89,7 +98,8 @@ pub(crate) fn rotation_vjp<T: Real>(unit: [T; 4], inverse_length: T, v: &Mat3<T>
             - two * z * (v[0][0] + v[1][1])),
     ];
     let radial = unit[0] * v_unit[0] + unit[1] * v_unit[1] + unit[2] * v_unit[2] + unit[3] * v_unit[3];
-    [0, 1, 2, 3].map(|i| inverse_length * (v_unit[i] - unit[i] * radial))
+    let tangent = |i: usize| inverse_length * (v_unit[i] - unit[i] * radial);
+    [tangent(0), tangent(1), tangent(2), tangent(3)]
 }
 
 /// √(½ log₂ e): with it folded into the whitening, exp(−q/2) = 2^−(u² + v²).
@@ -142,7 +152,11 @@ fn scaled<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Scaled<T> {
     } else {
         T::ONE
     };
-    let (r0, r1, eps) = (r0.map(|v| v * unit), r1.map(|v| v * unit), eps * unit * unit);
+    let (r0, r1, eps) = (
+        three(|i| r0[i] * unit),
+        three(|i| r1[i] * unit),
+        eps * unit * unit,
+    );
     let n = cross(r0, r1);
     let (a0, c0, area) = (dot(r0, r0), dot(r1, r1), dot(n, n));
     Scaled {
@@ -198,12 +212,12 @@ pub(crate) fn whiten_vjp<T: Real>(
     let [uu, uv, vv] = moments;
     let across = cross(s.r1, s.n);
     let along = w.w11 / s.unit / s.c;
-    let p0 = [0, 1, 2].map(|i| along * (across[i] + s.eps * s.r0[i]));
-    let p1 = s.r1.map(|r| w.w22 / s.unit * r);
-    let g0 = [0, 1, 2].map(|i| gain * (uu * p0[i] + uv * p1[i]));
-    let g1 = [0, 1, 2].map(|i| gain * (uv * p0[i] + vv * p1[i]));
-    let mut v_r0 = g0.map(|g| w.w11 * g);
-    let mut v_r1 = [0, 1, 2].map(|i| w.w12 * g0[i] + w.w22 * g1[i]);
+    let p0 = three(|i| along * (across[i] + s.eps * s.r0[i]));
+    let p1 = three(|i| w.w22 / s.unit * s.r1[i]);
+    let g0 = three(|i| gain * (uu * p0[i] + uv * p1[i]));
+    let g1 = three(|i| gain * (uv * p0[i] + vv * p1[i]));
+    let mut v_r0 = three(|i| w.w11 * g0[i]);
+    let mut v_r1 = three(|i| w.w12 * g0[i] + w.w22 * g1[i]);
     if let Some(v_compensation) = v_compensation {
         // compensation = |n| / √det with n = r₀ × r₁
         let v_det = -v_compensation * w.compensation / (two * s.det);
@@ -212,7 +226,7 @@ pub(crate) fn whiten_vjp<T: Real>(
         } else {
             T::ZERO
         };
-        let v_n = s.n.map(|x| x * (outward + two * v_det));
+        let v_n = three(|i| s.n[i] * (outward + two * v_det));
         let (from_r0, from_r1) = (cross(s.r1, v_n), cross(v_n, s.r0));
         for i in 0..3 {
             v_r0[i] += s.unit * (from_r0[i] + two * s.eps * v_det * s.r0[i]);

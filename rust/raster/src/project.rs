@@ -4,7 +4,8 @@
 
 use crate::camera::{Camera, CameraModel};
 use crate::cov::{
-    Mat3, Vec3, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, whiten, whiten_vjp,
+    Mat3, Vec3, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, three, whiten,
+    whiten_vjp,
 };
 use crate::real::Real;
 use crate::settings::Limits;
@@ -99,13 +100,13 @@ struct Footprint<T> {
 fn footprint<T: Real>(lens: &Lens<T>, mean: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
     let camera = &lens.camera;
     let rotated = apply(&camera.rotation, mean);
-    let point = [0, 1, 2].map(|i| rotated[i] + camera.translation[i]);
+    let point = three(|i| rotated[i] + camera.translation[i]);
     let (unit_quat, inverse_quat_length) = normalize_quat(quat);
     let axes = rotation_of(unit_quat);
-    let scaled = axes.map(|row| [row[0] * scale[0], row[1] * scale[1], row[2] * scale[2]]);
-    let shape = camera
-        .rotation
-        .map(|row| [0, 1, 2].map(|j| row[0] * scaled[0][j] + row[1] * scaled[1][j] + row[2] * scaled[2][j]));
+    let scaled = three(|i| three(|j| axes[i][j] * scale[j]));
+    let r = &camera.rotation;
+    let shape =
+        three(|i| three(|j| r[i][0] * scaled[0][j] + r[i][1] * scaled[1][j] + r[i][2] * scaled[2][j]));
 
     let k = &camera.k;
     let z = if lens.perspective { point[2] } else { T::ONE };
@@ -133,8 +134,8 @@ fn footprint<T: Real>(lens: &Lens<T>, mean: Vec3<T>, quat: [T; 4], scale: Vec3<T
         slopes: [sx, sy],
         free: [free_x, free_y],
         rows: [
-            [0, 1, 2].map(|j| gx * (shape[0][j] - sx * shape[2][j])),
-            [0, 1, 2].map(|j| gy * (shape[1][j] - sy * shape[2][j])),
+            three(|j| gx * (shape[0][j] - sx * shape[2][j])),
+            three(|j| gy * (shape[1][j] - sy * shape[2][j])),
         ],
     }
 }
@@ -186,7 +187,7 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
         T::of(f64::INFINITY)
     };
     let extent = extent(reach);
-    let [rx, ry] = w.deviations.map(|deviation| extent * deviation);
+    let (rx, ry) = (extent * w.deviations[0], extent * w.deviations[1]);
     // Comparisons are written so that NaN, which finite inputs can still overflow to, is culled too.
     // So far away that u and v overflow, it is as good as behind the camera; only reached without an alpha threshold.
     let distance = (w.w11 * x).abs() + (w.w12 * y).abs() + (w.w22 * y).abs();
@@ -257,16 +258,16 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
     let v_x = two * gain * w.w11 * v.first[0];
     let v_y = two * gain * (w.w12 * v.first[0] + w.w22 * v.first[1]);
     let v_compensation = if ANTIALIASED { Some(v.h * opacity) } else { None };
-    let moments = v.second.map(|m| gain * m);
+    let moments = three(|m| gain * v.second[m]);
     let (v_r0, v_r1) = whiten_vjp(shape.rows[0], shape.rows[1], eps, &w, moments, v_compensation);
 
     let [gx, gy] = shape.gains;
     let [sx, sy] = shape.slopes;
     // rows = gain (shape₀₁ − slope · shape₂)
     let v_shape = [
-        v_r0.map(|g| gx * g),
-        v_r1.map(|g| gy * g),
-        [0, 1, 2].map(|j| -(gx * sx * v_r0[j] + gy * sy * v_r1[j])),
+        three(|j| gx * v_r0[j]),
+        three(|j| gy * v_r1[j]),
+        three(|j| -(gx * sx * v_r0[j] + gy * sy * v_r1[j])),
     ];
     // Slopes: of the centre on screen always, of the Jacobian where the limit does not hold.
     let held = |free: bool, v: T| if free { v } else { T::ZERO };
@@ -282,11 +283,11 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
 
     // shape = R · axes · diag(scale)
     let columns =
-        [0, 1, 2].map(|j| apply_transposed(&camera.rotation, [v_shape[0][j], v_shape[1][j], v_shape[2][j]]));
-    let v_scale = [0, 1, 2].map(|j| dot(columns[j], [shape.axes[0][j], shape.axes[1][j], shape.axes[2][j]]));
-    let v_axes = [0, 1, 2].map(|i| [0, 1, 2].map(|j| columns[j][i] * scale[j]));
-    let v_rotation = [0, 1, 2].map(|r| {
-        [0, 1, 2].map(|c| {
+        three(|j| apply_transposed(&camera.rotation, [v_shape[0][j], v_shape[1][j], v_shape[2][j]]));
+    let v_scale = three(|j| dot(columns[j], [shape.axes[0][j], shape.axes[1][j], shape.axes[2][j]]));
+    let v_axes = three(|i| three(|j| columns[j][i] * scale[j]));
+    let v_rotation = three(|r| {
+        three(|c| {
             v_point[r] * mean[c]
                 + (v_shape[r][0] * shape.axes[c][0] * scale[0]
                     + v_shape[r][1] * shape.axes[c][1] * scale[1]
@@ -298,6 +299,6 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
         quat: rotation_vjp(shape.unit_quat, shape.inverse_quat_length, &v_axes),
         scale: v_scale,
         opacity: v.h * compensation,
-        viewmat: [0, 1, 2].map(|r| [v_rotation[r][0], v_rotation[r][1], v_rotation[r][2], v_point[r]]),
+        viewmat: three(|r| [v_rotation[r][0], v_rotation[r][1], v_rotation[r][2], v_point[r]]),
     }
 }
