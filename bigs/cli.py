@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import io
 import os
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 import tyro
 from rich.console import Console
 
+from bigs import __version__
 from bigs.checks import InputError
 
 if TYPE_CHECKING:
@@ -74,6 +76,7 @@ def reconstruct(
     config: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    perceptual_weights: tuple[Path, ...] = (),
     threads: int = 0,
 ) -> None:
     """Reconstruct the hands and the object of a clip into a run folder.
@@ -88,6 +91,8 @@ def reconstruct(
         config: a config.yaml of an earlier run, instead of a preset.
         set: change one setting, as path=value (raster.eps2d=0.2, stages.hands-fine.steps=50); repeatable.
         without: leave out one ingredient (share, smooth, contact, lighting, ...) or loss term; repeatable.
+        perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
+            "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
         threads: CPU threads; 0 takes all.
     """
     _use_threads(threads)
@@ -96,6 +101,9 @@ def reconstruct(
     from bigs.train.switches import without_all
 
     settings, unused = without_all(_config(preset, config, set), without)
+    if perceptual_weights:
+        files = tuple(str(path.resolve()) for path in perceptual_weights)
+        settings = dataclasses.replace(settings, perceptual_weights=files)
     with progress_listener(_err, settings) as listen:
         outcome = run(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen
@@ -212,6 +220,9 @@ GROUPS = {"bench": "Measure how fast and how exact this is."}
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; the exit code is 0 only on success."""
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        _out.print(f"bigs {__version__}", markup=False, highlight=False)
+        return
     try:
         _parse(arguments)()
     except InputError as error:
@@ -234,7 +245,8 @@ def _parse(arguments: list[str] | None) -> Callable[[], None]:
             return tyro.cli(
                 _choice_of(COMMANDS),
                 prog="bigs",
-                description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU.",
+                description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU. "
+                "The only option without a command is --version.",
                 args=arguments,
             )
     except SystemExit as stop:

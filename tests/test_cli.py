@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from command_line import Answer, assert_refused, run_bigs
 
+import bigs
 from bigs.checks import InputError
 from bigs.commands.reconstruct import Outcome
 from bigs.train.config import RunConfig
@@ -39,6 +40,10 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:
         assert word in text
+
+
+def test_version(call: Callable[..., Answer]) -> None:
+    assert call("--version") == (0, f"bigs {bigs.__version__}\n", "")
 
 
 @pytest.mark.parametrize(

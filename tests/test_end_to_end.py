@@ -25,6 +25,7 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
+from small_vgg import torchvision_state
 
 from bigs.commands.reconstruct import reconstruct
 from bigs.data.base import Clip
@@ -502,3 +503,31 @@ def test_hands_may_be_kept_apart(tiny_clip: Path, tmp_path: Path) -> None:
     written = load_file(tmp_path / "run" / "scene.safetensors")
     assert not np.array_equal(written["right.splats.colors"], written["left.splats.colors"])
     assert not np.array_equal(written["right.betas"], written["left.betas"])
+
+
+def test_a_network_for_the_perceptual_term(tiny_clip: Path, tmp_path: Path) -> None:
+    """Its file goes in by an option, and its path into the configuration."""
+    weights, out = tmp_path / "vgg16.pth", tmp_path / "run"
+    torch.save(torchvision_state(), weights)
+    stages = [stage.name for stage in PRESETS["smoke"].stages if isinstance(stage, OptimizeStage)]
+    quick = [f"--set=stages.{stage}.steps=1" for stage in stages]
+    answer = run_bigs(
+        *(
+            "reconstruct",
+            tiny_clip,
+            "--preset",
+            "smoke",
+            "--out",
+            out,
+            "--perceptual-weights",
+            weights,
+            *quick,
+        ),
+        *("--set", "stages.joint.weights.perceptual=0.5"),
+    )
+    assert answer.code == 0, answer.err
+    assert "perceptual" not in answer.out
+    assert yaml.safe_load((out / "config.yaml").read_text())["config"]["perceptual_weights"] == [str(weights)]
+    events = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    (joint,) = [event for event in events if event["event"] == "step" and event["stage"] == "joint"]
+    assert joint["terms"]["perceptual"] > 0

@@ -30,6 +30,7 @@ from bigs.data.base import Clip
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.hold import load_hold
 from bigs.hand import load_hand_models
+from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.image import psnr, ssim
 from bigs.metrics.report import comparison_table, evaluate
 from bigs.models.playback import Playback, record
@@ -86,6 +87,8 @@ def reconstruct(
     check_plan(config)
     clip = load_hold(clip_path)
     hand_models = load_hand_models(hand_model)
+    files = [Path(path) for path in config.perceptual_weights]
+    network = load_perceptual_weights(files) if files else None
     truth = None if ground_truth is None else load_ground_truth(ground_truth)
     if (out / CONFIG).exists() and not resume:
         raise InputError(f"{out}: expected a new run folder, found a run (pass --resume to continue it)")
@@ -117,7 +120,13 @@ def reconstruct(
             listen(event)
 
         scene, report = fit(
-            clip, hand_models, config, checkpoints=out / CHECKPOINTS, resume=resume, listen=log_and_listen
+            clip,
+            hand_models,
+            config,
+            perceptual=network,
+            checkpoints=out / CHECKPOINTS,
+            resume=resume,
+            listen=log_and_listen,
         )
         playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
         listen({"event": "note", "stage": "outputs", "text": "writing results"})

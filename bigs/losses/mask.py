@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -14,6 +15,23 @@ def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
     """
     outside = 1.0 - foreground
     return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
+
+
+def outside_mask_on(colors: Tensor, alphas: Tensor, foreground: Tensor, generator: torch.Generator) -> Tensor:
+    """`outside_mask` over a background of one random colour b, as in the released code: |I_pred - b| outside.
+
+    On black a Gaussian outside costs as much as it is bright; over a colour that changes from step to step
+    there is no colour to hide in. What is rendered on black becomes C + (1 - A) b, so the difference from b
+    is C - A b.
+
+    Args:
+        colors: [B, H, W, 3], rendered on black.
+        alphas: [B, H, W, 1].
+        foreground: as in `outside_mask`.
+        generator: draws b.
+    """
+    background = torch.rand(3, generator=generator)
+    return outside_mask(colors - alphas * background, foreground)
 
 
 def amodal_silhouette(alpha: Tensor, own: Tensor, hidden: Tensor) -> Tensor:

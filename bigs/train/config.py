@@ -98,6 +98,8 @@ class RunConfig:
     lighting: bool = True
     # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
+    # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
+    perceptual_weights: tuple[str, ...] = ()
     stages: tuple[Stage, ...] = ()
     # Steps between checkpoints within a stage; a stage's end is always saved.
     checkpoint_every: int = 100

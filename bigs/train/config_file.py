@@ -135,7 +135,8 @@ def _build_tuple(arguments: tuple[Any, ...], plain: Any, where: str) -> tuple[An
             raise InputError(f"{where}: expected stages by name, found {plain!r}")
         return tuple(_build_stage(item, name, stage, f"{where}.{name}") for name, stage in plain.items())
     if not isinstance(plain, list | tuple) or (arguments[-1] is not ... and len(plain) != len(arguments)):
-        raise InputError(f"{where}: expected {len(arguments)} values, found {plain!r}")
+        wanted = "a list" if arguments[-1] is ... else f"{len(arguments)} values"
+        raise InputError(f"{where}: expected {wanted}, found {plain!r}")
     return tuple(_build(item, value, f"{where}[{i}]") for i, value in enumerate(plain))
 
 

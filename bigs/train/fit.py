@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import bigs
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.hand import HandModel
+from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
@@ -30,6 +31,7 @@ from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.optim import GROUPS
 from bigs.train.scale_search import search_object_scale
+from bigs.train.switches import without
 from bigs.train.targets import Targets, crop_box, load_targets
 from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence, labels
 from bigs.train.terms import Step as LossStep
@@ -57,6 +59,7 @@ def fit(
     hand_models: Mapping[Side, HandModel],
     config: RunConfig,
     *,
+    perceptual: VggWeights | None = None,
     checkpoints: Path | None = None,
     resume: bool = False,
     listen: Listener = lambda event: None,
@@ -67,6 +70,7 @@ def fit(
         clip: the loaded clip.
         hand_models: both sides' models.
         config: what to do.
+        perceptual: the network for the term of that name; without it the term is off.
         checkpoints: folder for checkpoints; None keeps none.
         resume: continue from the checkpoint there, if there is one.
         listen: told of stages, steps and notes as they happen.
@@ -76,6 +80,10 @@ def fit(
         FloatingPointError: a loss became infinite or not a number.
     """
     report = FitReport()
+    config, note = _without_missing_network(config, perceptual)
+    if note:
+        listen({"event": "note", "stage": "start values", "text": note})
+        report.skipped.append(note)
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
@@ -84,13 +92,13 @@ def fit(
     )
     report.skipped += notes
     report.seconds["start values"] = time.perf_counter() - began
-    digest = run_digest(clip, scene, config)
+    digest = run_digest(clip, scene, config, perceptual)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
     first = position.stage if position else 0
     if position:
         done = position.resume["step"] if position.resume else 0
         listen({"event": "resume", "index": first, "step": done})
-    sources = _EvidenceSource(clip, unknown, scene, config)
+    sources = _EvidenceSource(clip, unknown, scene, config, perceptual)
 
     for index, stage in enumerate(config.stages):
         if index < first:
@@ -164,6 +172,23 @@ def _optimise(
     )
 
 
+def _without_missing_network(config: RunConfig, network: VggWeights | None) -> tuple[RunConfig, str | None]:
+    """The configuration without the term that needs a network, if there is none; what to tell the user."""
+    asking = [
+        stage.name
+        for stage in config.stages
+        if isinstance(stage, OptimizeStage) and "perceptual" in stage.weights
+    ]
+    if network is not None:
+        unused = "a network was given, but no stage has the term (--set stages.NAME.weights.perceptual=1)"
+        return config, None if asking else f"perceptual: {unused}"
+    if not asking:
+        return config, None
+    return without(config, "perceptual"), (
+        f"perceptual: off in {', '.join(asking)}; --perceptual-weights FILE with VGG-16 turns it on"
+    )
+
+
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
     if isinstance(stage, ScaleSearchStage | GraspStage):
@@ -172,6 +197,8 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
         return None
     if isinstance(stage, SplitStage):
         return "the clip has no object" if scene.object_splats is None else None
+    if not stage.weights:
+        return "no loss term is left"
     subjects = {group.split(".")[0] for group in stage.lrs}
     if subjects == {"hand"} and not scene.sides:
         return "the clip has no hand"
@@ -180,14 +207,17 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
     return None
 
 
-def run_digest(clip: Clip, scene: Scene, config: RunConfig) -> str:
+def run_digest(clip: Clip, scene: Scene, config: RunConfig, perceptual: VggWeights | None) -> str:
     """Identifies what a checkpoint belongs to: version, configuration, images, masks and start values."""
+    # Of a network counts what is in it, not where it lies.
+    config = replace(config, perceptual_weights=())
     text = json.dumps([bigs.__version__, clip.name, list(clip.frame_names), asdict(config)], sort_keys=True)
     digest = hashlib.sha256(text.encode())
     for path in (*clip.image_paths, *clip.mask_paths):
         digest.update(path.read_bytes())
     # Parameters hold the fields' random start; buffers hold poses, surface and the hand model.
-    for values in (*scene.parameters(), *scene.buffers()):
+    network = () if perceptual is None else perceptual.tensors()
+    for values in (*scene.parameters(), *scene.buffers(), *network):
         digest.update(values.detach().numpy().tobytes())
     return digest.hexdigest()[:16]
 
@@ -195,11 +225,19 @@ def run_digest(clip: Clip, scene: Scene, config: RunConfig) -> str:
 class _EvidenceSource:
     """Makes each stage's evidence; what several stages share is made once, when first asked for."""
 
-    def __init__(self, clip: Clip, unknown: np.ndarray, scene: Scene, config: RunConfig) -> None:
+    def __init__(
+        self,
+        clip: Clip,
+        unknown: np.ndarray,
+        scene: Scene,
+        config: RunConfig,
+        perceptual: VggWeights | None,
+    ) -> None:
         self.clip = clip
         self.unknown = unknown
         self.scene = scene
         self.config = config
+        self.perceptual = perceptual
         self.box = crop_box(clip)
         self.touching: dict[Side, Tensor] = {
             side: torch.as_tensor(touching_frames(clip, side), dtype=torch.float32)
@@ -212,7 +250,9 @@ class _EvidenceSource:
     def evidence(self, stage: Stage) -> Evidence:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
-        return Evidence(targets, self.touching, silhouettes, self.config.contact, self.config.raster)
+        return Evidence(
+            targets, self.touching, silhouettes, self.config.contact, self.config.raster, self.perceptual
+        )
 
     def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:
         """The label term of the scene as it is, over some frames: which subject hides which."""

@@ -106,6 +106,8 @@ def run_stage(
     if unknown:
         accepted = ", ".join([*image_terms, *TERMS])
         raise InputError(f"stage {stage.name}: expected terms out of {accepted}, found {unknown[0]!r}")
+    if "perceptual" in stage.weights and evidence.perceptual is None:
+        raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     optimizer = make_optimizer(scene, stage.lrs)
     state = StageState(0, optimizer, float("inf"), 0, float("nan"), 0)
     if resume is not None:
@@ -136,6 +138,7 @@ def run_stage(
             {**fixed, **scene.canonical(moving)},
             choose_frames(scene.n_frames, stage, seed, state.step),
             "labels" in stage.weights,
+            seed * 1_000_003 + state.step,
         )
         terms, problem = _evaluate(step, stage)
         loss = weighted_sum(terms, stage.weights) if problem is None else None

@@ -207,9 +207,9 @@ SMOKE = replace(
 )
 
 # The paper as written: Eq. 4-6 alone for each subject, then Eq. 9 with Eq. 8, one frame a step at full size,
-# the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. The terms
-# that need weights of other networks (L_vgg, L_SDS) are not in it.
-_PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "color": 0.1, "scale": 100.0, "mask": 10.0}
+# the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. L_vgg counts
+# when its network is given; L_SDS, which needs other networks, is not in it.
+_PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "color": 0.1, "scale": 100.0, "mask": 10.0}
 PAPER = RunConfig(
     initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
     hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3),
@@ -256,7 +256,7 @@ PAPER = RunConfig(
             step="interacting-subjects",
             steps=30_000,
             lrs={"hand.ray": 2e-3, "hand.depth": 2e-3},
-            weights={"image": 1.0, "ssim": 0.2, "mask": 10.0, "contact": 1.0},
+            weights={"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "mask": 10.0, "contact": 1.0},
             frames_per_step=1,
             final_lr=0.01,
         ),

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from bigs.losses.contact import center_contact, penetration, surface_contact
-from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask
+from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on
+from bigs.losses.perceptual import VggWeights, masked_perceptual
 from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
@@ -32,6 +33,7 @@ class Evidence:
     silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands, of this resolution
     contact: str  # "center" or "surface"
     settings: RasterSettings
+    perceptual: VggWeights | None = None  # what the term "perceptual" needs
 
 
 @dataclass
@@ -44,6 +46,7 @@ class Step:
     canonical: dict[Entity, CanonicalHand | CanonicalObject]
     frames: Tensor  # [B]
     with_labels: bool = True  # whether the joint rendering has label channels
+    seed: int = 0  # of what the terms draw
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
 
     @property
@@ -65,6 +68,10 @@ class Step:
 
     def share(self, entity: Entity) -> Tensor:
         return self.evidence.targets.shares[entity][self.frames]
+
+    def generator(self) -> torch.Generator:
+        """A fresh one for each term, so that what one term draws does not depend on the others."""
+        return torch.Generator().manual_seed(self.seed)
 
     def render(self, gaussians: Gaussians) -> RenderOutput:
         """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
@@ -142,6 +149,24 @@ def mask_alone(step: Step) -> Tensor:
     return _mean(outside_mask(step.alone(entity).colors, step.foreground) for entity in step.entities)
 
 
+def mask_random_alone(step: Step) -> Tensor:
+    generator = step.generator()
+    return _mean(
+        outside_mask_on(step.alone(entity).colors, step.alone(entity).alphas, step.foreground, generator)
+        for entity in step.entities
+    )
+
+
+def perceptual_alone(step: Step) -> Tensor:
+    generator = step.generator()
+    return _mean(
+        masked_perceptual(
+            step.alone(entity).colors, step.images, step.share(entity), step.evidence.perceptual, generator
+        )
+        for entity in step.entities
+    )
+
+
 def coverage_alone(step: Step) -> Tensor:
     """Each subject opaque on its own pixels, absent from the background, free where others may hide it."""
     targets = step.evidence.targets
@@ -167,6 +192,21 @@ def ssim_together(step: Step) -> Tensor:
 
 def mask_together(step: Step) -> Tensor:
     return outside_mask(step.together.colors[..., :3], step.foreground)
+
+
+def mask_random_together(step: Step) -> Tensor:
+    rendered = step.together
+    return outside_mask_on(rendered.colors[..., :3], rendered.alphas, step.foreground, step.generator())
+
+
+def perceptual_together(step: Step) -> Tensor:
+    return masked_perceptual(
+        step.together.colors[..., :3],
+        step.images,
+        step.foreground,
+        step.evidence.perceptual,
+        step.generator(),
+    )
 
 
 def labels(step: Step) -> Tensor:
@@ -311,14 +351,18 @@ IMAGE_TERMS: dict[str, dict[str, Callable[[Step], Tensor]]] = {
         "image": image_alone,
         "mse": mse_alone,
         "ssim": ssim_alone,
+        "perceptual": perceptual_alone,
         "mask": mask_alone,
+        "mask_random": mask_random_alone,
         "coverage": coverage_alone,
     },
     "interacting-subjects": {
         "image": image_together,
         "mse": mse_together,
         "ssim": ssim_together,
+        "perceptual": perceptual_together,
         "mask": mask_together,
+        "mask_random": mask_random_together,
         "labels": labels,
     },
 }

@@ -175,6 +175,20 @@ def test_broken_hand_models(
 # --- other files ---
 
 
+@pytest.mark.parametrize("content", [None, b"hello"])
+def test_broken_networks(
+    call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path, content: bytes | None
+) -> None:
+    file, out = tmp_path / "vgg.pth", tmp_path / "out"
+    if content is not None:
+        file.write_bytes(content)
+    answer = call(
+        *("reconstruct", tiny_clip, "--out", out, "--preset", "smoke", "--perceptual-weights", file)
+    )
+    assert_refused(answer, "vgg.pth: ", "expected", "found")
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask
+from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on
 
 
 def images(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -16,6 +16,23 @@ def test_outside_mask_sees_only_the_outside() -> None:
     assert outside_mask(pred, torch.ones(2, 4, 5)) == 0.0
     pred[:, :, 3:] = 0.0
     assert outside_mask(pred, foreground) == 0.0
+
+
+def test_a_random_background_is_as_if_rendered_over_it() -> None:
+    """Eq. 5's regulariser on C + (1 - A) b, whose empty pixels are b and must cost nothing."""
+    alphas, own = images(2, 4, 5, 1, seed=1).float(), images(2, 4, 5, 3).float()
+    alphas[0, :2] = 0.0
+    foreground = (images(2, 4, 5, seed=2) > 0.5).float()
+    b = torch.rand(3, generator=torch.Generator().manual_seed(7))
+    over = alphas * own + (1 - alphas) * b
+    expected = outside_mask(over - b, foreground)
+    found = outside_mask_on(alphas * own, alphas, foreground, torch.Generator().manual_seed(7))
+    torch.testing.assert_close(found, expected)
+    # A black Gaussian hides on black only.
+    black = torch.zeros(2, 4, 5, 3)
+    assert outside_mask(black, foreground) == 0.0
+    assert outside_mask_on(black, alphas, foreground, torch.Generator().manual_seed(7)) > 0.05
+    assert outside_mask_on(black, 0 * alphas, foreground, torch.Generator().manual_seed(7)) == 0.0
 
 
 def test_amodal_silhouette_by_hand() -> None:

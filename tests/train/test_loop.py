@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from small_vgg import small_network
 from torch import Tensor
 from toy_scenes import cube_scene
 
@@ -26,6 +27,7 @@ from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence
 from bigs.types import Side
 
 FRAMES = 3
+
 
 ALONE = OptimizeStage(
     name="alone",
@@ -61,7 +63,7 @@ def evidence(scene: Scene) -> Evidence:
     )
     touching = {side: torch.ones(FRAMES) for side in ("right", "left")}
     outlines = {side: silhouette_hand(scene.hand_model(side), 0.003, 0.004) for side in scene.sides}
-    return Evidence(targets, touching, outlines, "surface", RasterSettings())
+    return Evidence(targets, touching, outlines, "surface", RasterSettings(), small_network())
 
 
 def values(scene: Scene) -> dict[str, Tensor]:
@@ -300,6 +302,29 @@ def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None
             run_stage(scene, stage, evidence, 0, after_step=lambda p, _, seen=seen: seen.append(p.loss))
             assert seen[0] >= 0, name
             assert all(torch.isfinite(p).all() for p in scene.parameters()), name
+
+
+@pytest.mark.parametrize("term", ["perceptual", "mask_random"])
+def test_what_terms_draw_depends_on_seed_and_step_alone(scene: Scene, evidence: Evidence, term: str) -> None:
+    """A run that goes on after an interruption draws what it would have drawn."""
+    stage = replace(ALONE, steps=3, lrs={"hand.ray": 0.0}, weights={term: 1.0}, frames_per_step=0)
+
+    def losses(seed: int) -> list[float]:
+        seen: list[float] = []
+        run_stage(scene, stage, evidence, seed, after_step=lambda p, _: seen.append(p.loss))
+        return seen
+
+    first = losses(0)
+    assert len(set(first)) == 3  # nothing moves, so only what is drawn differs
+    torch.rand(5)
+    assert losses(0) == first
+    assert not set(losses(1)) & set(first)
+
+
+def test_without_a_network_the_perceptual_term_is_refused(scene: Scene, evidence: Evidence) -> None:
+    stage = replace(ALONE, weights={"perceptual": 1.0})
+    with pytest.raises(InputError, match="expected a network for the term 'perceptual', found none"):
+        run_stage(scene, stage, replace(evidence, perceptual=None), 0)
 
 
 # --- what does not last ---

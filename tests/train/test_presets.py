@@ -51,8 +51,17 @@ def test_every_preset_runs_both_of_the_papers_steps() -> None:
 
 def test_the_paper_preset_has_the_papers_terms() -> None:
     paper = {stage.name: stage for stage in PRESETS["paper"].stages}
-    assert set(paper["hands"].weights) == {"image", "ssim", "color", "scale", "mask", "smooth", "lbs"}
-    assert set(paper["object"].weights) == {"image", "ssim", "color", "scale", "mask"}
+    assert set(paper["hands"].weights) == {
+        "image",
+        "ssim",
+        "perceptual",
+        "color",
+        "scale",
+        "mask",
+        "smooth",
+        "lbs",
+    }
+    assert set(paper["object"].weights) == {"image", "ssim", "perceptual", "color", "scale", "mask"}
     assert "contact" in paper["translations"].weights
     assert set(paper["translations"].lrs) == {"hand.ray", "hand.depth"}
     assert PRESETS["paper"].contact == "center"

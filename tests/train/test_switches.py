@@ -50,7 +50,8 @@ def test_every_switch_does_something_somewhere() -> None:
     """No switch of a name that nothing answers to; what no preset uses is put into a plan here."""
     joint = FAST.stages[-1]
     assert isinstance(joint, OptimizeStage)
-    rest = replace(joint, name="rest", weights={"offset": 1.0, "smooth": 1.0, "color": 1.0}, stop_patience=9)
+    names = ("offset", "smooth", "color", "mask_random")
+    rest = replace(joint, name="rest", weights=dict.fromkeys(names, 1.0), stop_patience=9)
     plans = [*PRESETS.values(), replace(FAST, stages=(*FAST.stages, SplitStage(), rest))]
     idle = [name for name in SWITCHES if all(without(plan, name) == plan for plan in plans)]
     assert idle == []
