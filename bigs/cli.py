@@ -1,4 +1,4 @@
-"""The command line: demo, info, reconstruct, eval, render, export, bench. Only this file prints or exits."""
+"""The command line: demo, info, reconstruct, eval, ... Only this file prints or exits."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from bigs import __version__
 from bigs.checks import InputError
 
 if TYPE_CHECKING:
+    from bigs.bench.page import Table
     from bigs.commands.reconstruct import Outcome
     from bigs.train.config import RunConfig
 
@@ -156,6 +157,50 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
         _out.print(str(path), markup=False, highlight=False, soft_wrap=True)
 
 
+def ablate(
+    clip: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    preset: Preset = "fast",
+    rows: tuple[str, ...] | None = None,
+    hand_model: Path | None = None,
+    gt: Path | None = None,
+    config: Path | None = None,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    threads: int = 0,
+) -> None:
+    """Score the method with and without its ingredients on a clip, beside the paper's Table 3.
+
+    Args:
+        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+        out: folder for one run per row, ablation.md and ablation.json; rows that it holds are not run again.
+        preset: the full method.
+        rows: what to leave out, each a name of reconstruct --without or several joined by +; the paper's if
+            not given.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        gt: ground truth (gt.npz) to score against; the clip's own if not given.
+        config: a config.yaml of an earlier run, instead of a preset.
+        set: change one setting, as path=value; repeatable.
+        threads: CPU threads; 0 takes all.
+    """
+    _use_threads(threads)
+    from bigs.commands.ablate import ablate as run
+    from bigs.commands.ablate import default_rows
+
+    settings = _config(preset, config, set)
+    with _err.status("starting") as status:
+        found = run(
+            clip,
+            out,
+            settings,
+            default_rows() if rows is None else rows,
+            hand_model=hand_model,
+            ground_truth=gt,
+            listen=status.update,
+        )
+    _print_tables([found.table], out)
+    _fail_for(found.failed)
+
+
 def bench_engine(
     out: Path = Path("bench"),
     workloads: tuple[Workload, ...] = ("A", "B", "C", "D"),
@@ -196,11 +241,7 @@ def bench_engine(
             budget=budget,
             listen=status.update,
         )
-    for table in tables:
-        _out.print(f"\n{table.title}", markup=False, highlight=False)
-        _print_table(table.rows)
-        _out.print(table.note, markup=False, highlight=False)
-    _out.print(f"results in {out}", markup=False, highlight=False, soft_wrap=True)
+    _print_tables(tables, out)
 
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -212,6 +253,7 @@ COMMANDS: Commands = {
     "eval": evaluate,
     "render": render,
     "export": export,
+    "ablate": ablate,
     "bench": {"engine": bench_engine},
 }
 # What the help says of commands that have commands of their own.
@@ -310,6 +352,22 @@ def _show(outcome: Outcome) -> None:
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.report.seconds.items())
     _out.print(f"{outcome.seconds:.0f} s in all: {times}", markup=False, highlight=False, soft_wrap=True)
     _out.print(f"results in {outcome.run}: see preview.png and report.html", markup=False, soft_wrap=True)
+
+
+def _print_tables(tables: list[Table], out: Path) -> None:
+    for table in tables:
+        _out.print(f"\n{table.title}", markup=False, highlight=False)
+        _print_table(table.rows)
+        _out.print(table.note, markup=False, highlight=False)
+    _out.print(f"results in {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _fail_for(runs: list[str]) -> None:
+    """The exit of a series of which some runs came to nothing."""
+    if runs:
+        _fail(
+            f"{len(runs)} failed ({', '.join(runs)}); the others are kept, and a rerun tries these again", 5
+        )
 
 
 def _print_table(rows: list[tuple[str, ...]]) -> None:

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from bigs.bench.engine import FLOPS_BACKWARD, FLOPS_FORWARD
 from bigs.bench.errors import COLUMNS
-
-Rows = list[tuple[str, ...]]
+from bigs.bench.page import Rows, Table, page
 
 # Columns of the plain times.
 _SUMS = ("forward_cpu", "backward_cpu", "cpu", "fastest_cpu", "wall", "fastest_wall")
 # What `_raster.time_engine` calls its stages.
 _STAGES = ("project", "bin", "composite", "composite vjp", "project vjp")
-
-
-class Table(NamedTuple):
-    """Rows of equal length, the first being the heading, and what one has to know to read them."""
-
-    title: str
-    note: str
-    rows: Rows
 
 
 def tables_of(report: dict[str, Any]) -> list[Table]:
@@ -34,23 +25,13 @@ def tables_of(report: dict[str, Any]) -> list[Table]:
 def markdown(report: dict[str, Any], tables: list[Table]) -> str:
     """The whole report as a page."""
     machine = report["machine"]
-    lines = [
-        "# bigs bench engine",
-        "",
+    introduction = (
         f"bigs {report['bigs']}, torch {report['torch']}, {machine['cpu']} ({machine['level']}), "
         f"{machine['cores']} cores, {machine['system']}; load at the start {machine['load']:.1f}. "
         f"Workloads from {report['workloads_from']}, scale {report['scale']:g}. "
-        f"Medians of up to {report['repeats']} alternating runs; {report['seconds']:.0f} s in all.",
-    ]
-    for table in tables:
-        heading, *body = table.rows
-        lines += ["", f"## {table.title}", "", table.note, "", _markdown_row(heading)]
-        lines += [_markdown_row(("---",) * len(heading)), *map(_markdown_row, body)]
-    return "\n".join(lines) + "\n"
-
-
-def _markdown_row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(cells) + " |"
+        f"Medians of up to {report['repeats']} alternating runs; {report['seconds']:.0f} s in all."
+    )
+    return page("bigs bench engine", introduction, tables)
 
 
 def _ms(value: float) -> str:

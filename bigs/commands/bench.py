@@ -10,8 +10,9 @@ from typing import Any
 from bigs.atomic import atomic_write
 from bigs.bench.chart import check_drawing, draw_curve
 from bigs.bench.engine import measure
+from bigs.bench.page import Table
 from bigs.bench.plan import Plan, check_plan
-from bigs.bench.tables import Table, markdown, tables_of
+from bigs.bench.tables import markdown, tables_of
 from bigs.bench.workloads import WorkloadSpec, from_environment
 from bigs.checks import InputError
 from bigs.commands.run_folder import write_json

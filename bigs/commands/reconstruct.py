@@ -96,15 +96,9 @@ def reconstruct(
     scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
 
     out.mkdir(parents=True, exist_ok=True)
-    origin = {
-        "bigs": bigs.__version__,
-        "torch": str(torch.__version__),
-        "clip": str(Path(clip_path).resolve()),
-        "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
-    }
     if not (out / CONFIG).exists():
-        save_config(out / CONFIG, config, origin)
-    log: list[dict[str, Any]] = _read_log(out / LOG) if resume else []
+        save_config(out / CONFIG, config, run_origin(clip_path, hand_model))
+    log: list[dict[str, Any]] = read_log(out / LOG) if resume else []
     with (out / LOG).open("a" if resume else "w") as file:
 
         def log_and_listen(event: dict[str, Any]) -> None:
@@ -141,7 +135,17 @@ def reconstruct(
     return Outcome(out, table, report, time.perf_counter() - began)
 
 
-def _read_log(path: Path) -> list[dict[str, Any]]:
+def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:
+    """What identifies a run besides its configuration, as it stands in `config.yaml`."""
+    return {
+        "bigs": bigs.__version__,
+        "torch": str(torch.__version__),
+        "clip": str(Path(clip_path).resolve()),
+        "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
+    }
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
     """The rows of a log; a last line that was cut off when the run was killed is left out."""
     rows = []
     for line in path.read_text().splitlines() if path.exists() else []:

@@ -131,7 +131,7 @@ _INGREDIENTS = {
         lambda config: replace(config, hand=replace(config.hand, shared=False)),
     ),
     "smooth": Switch(
-        "hands' motion: the smoothing of their estimates, L_smt, and acceleration of the joints",
+        "the hands' motion: the smoothing of their estimates, L_smt, acceleration of the joints",
         _all_of(_terms("smooth", "acceleration"), _smooth),
     ),
     "contact": Switch(
@@ -143,7 +143,7 @@ _INGREDIENTS = {
         "the object's motion: the smoothing of its estimates, and acceleration",
         _all_of(_terms("object_acceleration"), _object_smooth),
     ),
-    "scale_search": Switch("the search of the object's size", _scale_search),
+    "scale_search": Switch("the search of the object's size alone", _scale_search),
     "grasps": Switch(
         "grasps, in which the object carries a hand",
         _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -81,6 +82,13 @@ def test_our_switches() -> None:
     sizes = [stage.image_size for stage in FAST.stages if isinstance(stage, OptimizeStage)]
     same = [stage.image_size for stage in without(FAST, "pyramid").stages if isinstance(stage, OptimizeStage)]
     assert len(set(sizes)) > 1 and set(same) == {max(sizes)}
+
+
+def test_the_page_names_every_ingredient() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "cli.md").read_text()
+    assert [name for name, switch in SWITCHES.items() if f"| `{name}` | {switch.text} |" not in page] == [
+        name for name in SWITCHES if SWITCHES[name].text == f"the loss term {name}"
+    ]
 
 
 def test_a_preset_is_not_changed() -> None:

@@ -1,0 +1,178 @@
+"""The paper's Table 3 on a clip: which rows there are, what they cost to repeat, and one that fails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import Answer, assert_refused
+
+from bigs.checks import InputError
+from bigs.commands import series
+from bigs.commands.ablate import Row, ablate, default_rows, parse_rows
+from bigs.commands.run_folder import CONFIG, LOG, METRICS, write_json
+from bigs.train.config import RunConfig
+from bigs.train.config_file import load_config, save_config
+from bigs.train.presets import PRESETS
+
+SMOKE = PRESETS["smoke"]
+SCORES = {
+    "mpjpe_ra_r": 9.0,
+    "mpjpe_ra_l": 8.0,
+    "cd_r_sq": 1.5,
+    "cd_l_sq": 2.5,
+    "cd_icp_sq": 0.5,
+    "f10_icp": 97.5,
+}
+
+
+class FakeRuns:
+    """Stands for `reconstruct`: writes what a run leaves behind, and counts."""
+
+    def __init__(self) -> None:
+        self.made: list[str] = []
+        self.fail: str | None = None
+
+    def __call__(
+        self,
+        clip: Path,
+        out: Path,
+        config: RunConfig,
+        *,
+        hand_model: Path | None,
+        ground_truth: Path | None,
+        resume: bool,
+        listen: Callable[[Mapping[str, Any]], None],
+    ) -> None:
+        assert resume == (out / CONFIG).exists()
+        self.made.append(out.name)
+        out.mkdir(exist_ok=True)
+        save_config(out / CONFIG, config, series.run_origin(clip, hand_model))
+        listen({"event": "stage", "stage": "joint", "index": 0, "stages": 1})
+        listen({"event": "step", "stage": "joint", "step": 1, "steps": 2})
+        if out.name == self.fail:
+            raise FloatingPointError("stage joint, step 1: image is not finite")
+        (out / LOG).write_text('{"event": "skipped", "text": "joint: 1 of 2 steps, the loss had settled"}\n')
+        write_json(out / METRICS, {"initial": SCORES, "result": SCORES | {"cd_r_sq": len(out.name) / 8}})
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
+    fake = FakeRuns()
+    monkeypatch.setattr("bigs.commands.series.reconstruct", fake)
+    return fake
+
+
+def test_the_papers_rows() -> None:
+    assert default_rows() == ["contact", "smooth", "share", "contact+smooth", "contact+smooth+share"]
+    papers = {row.name: row.paper for row in parse_rows(default_rows())}
+    # CD_l, CD_r, CD_o, F10, MPJPE_l, MPJPE_r; L_SDS is missing from all of ours.
+    assert papers == {
+        "full": (50.78, 35.57, 1.36, 81.78, 24.63, 24.35),
+        "contact": (83.14, 96.95, 1.36, 81.78, 24.63, 24.35),
+        "smooth": None,
+        "share": None,
+        "contact+smooth": (96.55, 117.72, 1.36, 81.78, 27.01, 24.42),
+        "contact+smooth+share": (96.56, 117.72, 1.36, 81.78, 27.22, 25.08),
+    }
+
+
+def test_rows_as_they_are_asked_for() -> None:
+    assert parse_rows(["share,lighting", "smooth+contact", "contact+smooth", "full"]) == [
+        Row(()),
+        Row(("share",)),
+        Row(("lighting",)),
+        Row(("smooth", "contact")),
+    ]
+    with pytest.raises(InputError, match=r"--rows share\+blur: expected names out of full, share, .*'blur'"):
+        parse_rows(["share+blur"])
+    with pytest.raises(InputError, match="--rows prior: expected what this version has, found 'prior'"):
+        parse_rows(["prior"])
+
+
+def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
+    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", "split"])
+    assert runs.made == ["full", "contact+smooth", "split"] and found.failed == []
+    assert load_config(tmp_path / "out" / "full" / CONFIG) == SMOKE
+    less = load_config(tmp_path / "out" / "contact+smooth" / CONFIG)
+    assert less.initial.smooth_hands == 0.0
+    assert not any("contact" in stage.weights for stage in less.stages if hasattr(stage, "weights"))
+
+    rows = {(row[0], row[1]): row[2:] for row in found.table.rows}
+    assert rows["nothing, with prior", "bigs"][-1] == "off: no diffusion prior in this version"
+    assert rows["nothing", "bigs"][:6] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
+    assert rows["contact + smooth", "bigs"][1] == "1.75"
+    assert rows["", "paper"][0] == "96.55"  # of the row above it
+    assert rows["split", "bigs"][-1] == "this plan has nothing of split"
+    assert rows["initial estimates", "bigs"][1] == "1.50"
+    assert "datasets differ" in found.table.note
+
+    page = (tmp_path / "out" / "ablation.md").read_text()
+    assert page.count("| paper |") == 3 and "datasets differ" in page
+    numbers = {
+        row["row"]: row for row in json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
+    }
+    assert list(numbers) == ["full", "contact+smooth", "split"]
+    assert numbers["full"]["paper"]["cd_l_sq"] == 50.78
+    assert numbers["full"]["scores"]["result"]["cd_r_sq"] == 0.5
+    assert numbers["full"]["times"]["stages"]["joint"]["steps"] == 1
+    assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had settled"]
+
+
+def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
+    runs.fail = "share"
+    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["share", "smooth"])
+    assert found.failed == ["share"]
+    (row,) = [row for row in found.table.rows if row[0] == "share"]
+    assert "failed: FloatingPointError: stage joint, step 1" in row[-1]
+    (other,) = [row for row in found.table.rows if row[0] == "smooth"]
+    assert other[3] == "0.75"
+
+    runs.fail, runs.made = None, []
+    again = ablate(tiny_clip, tmp_path / "out", SMOKE, ["share", "smooth"])
+    assert runs.made == ["share"] and again.failed == []
+    assert [row for row in again.table.rows if row[0] == "smooth"] == [other]
+
+
+def test_a_folder_of_other_runs_is_refused(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ablate(tiny_clip, out, SMOKE, ["share"])
+    with pytest.raises(InputError, match=r"full.config\.yaml: expected the configuration of this run"):
+        ablate(tiny_clip, out, replace(SMOKE, seed=1), ["share"])
+    with pytest.raises(InputError, match=r"config\.yaml: hand_model: expected .*hands, found None"):
+        ablate(tiny_clip, out, SMOKE, ["share"], hand_model=tmp_path / "hands")
+    assert runs.made == ["full", "share"]
+
+
+def test_what_the_command_line_says(
+    runs: FakeRuns, call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert_refused(call("ablate", tiny_clip, "--out", out, "--rows", "blur"), "--rows blur", "found 'blur'")
+    assert_refused(call("ablate", tiny_clip / "build", "--out", out, "--gt", tmp_path), "gt.npz")
+    assert not out.exists()
+    runs.fail = "share"
+    answer = call("ablate", tiny_clip, "--out", out, "--preset", "smoke", "--rows", "share", "smooth")
+    assert answer.code == 5
+    assert "1 failed (share); the others are kept" in answer.err
+    assert "datasets differ" in answer.out
+    assert load_config(out / "full" / CONFIG) == SMOKE
+    runs.fail = None
+    assert call("ablate", tiny_clip, "--out", out, "--preset", "smoke", "--rows", "share,smooth").code == 0
+
+
+@pytest.mark.slow
+def test_a_real_row(tiny_clip: Path, tmp_path: Path) -> None:
+    """A plan of two short stages, with its scores and times."""
+    stages = [replace(stage, steps=2) for stage in SMOKE.stages if stage.name in ("hands-coarse", "joint")]
+    found = ablate(tiny_clip, tmp_path / "out", replace(SMOKE, stages=tuple(stages)), [])
+    assert found.failed == []
+    (row,) = json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
+    assert row["scores"]["result"]["mpjpe_ra_r"] > 0
+    assert list(row["times"]["stages"]) == ["start values", "hands-coarse", "joint", "outputs"]
+    assert row["times"]["stages"]["joint"]["phases"]["engine backward"] > 0
+    assert row["times"]["wall"] == pytest.approx(sum(s["wall"] for s in row["times"]["stages"].values()))
