@@ -90,8 +90,10 @@ def rasterization(
         Gaussian that no pixel sees), tile_size. The rust backend adds gsplat's tile_width, tile_height,
         width, height, n_cameras, n_batches, and counts of its work, summed over the images: n_isects pairs of
         Gaussian and tile, n_visible and n_culled Gaussians that some or no pixel can see, n_empty_tiles that
-        no Gaussian reaches or that pixel_mask closes, and after a backward pass n_tiles_without_gradient,
-        reached by Gaussians but not by a gradient. What is culled, empty or without gradient is skipped.
+        no Gaussian reaches or that pixel_mask closes, n_saturated pixels that stopped at min_transmittance.
+        A backward pass adds n_tiles_without_gradient, reached by Gaussians but not by a gradient, and
+        gradients_skipped, the names of the inputs that asked for none. What is culled, empty, behind a
+        saturated pixel or without gradient is skipped.
 
     Raises:
         InputError: a shape, dtype, value or camera that cannot be rendered.

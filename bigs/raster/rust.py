@@ -16,6 +16,7 @@ from bigs.raster.settings import RasterSettings
 # In the engine's order: means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, pixel_mask.
 # The first six and backgrounds are differentiable; the last two may be absent.
 Inputs = tuple[torch.Tensor | None, ...]
+DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 
 # Whether info's means2d are mere values or a tensor of the graph: of all Gaussians, or of those seen.
 Means2d = Literal["values", "full", "packed"]
@@ -89,6 +90,13 @@ class _Rasterize(torch.autograd.Function):
             (*six, backgrounds, want_means2d, ctx.absgrad and want_means2d),
         )
         ctx.info["n_tiles_without_gradient"] = tiles_skipped
+        ctx.info["gradients_skipped"] = tuple(
+            name
+            for name, tensor, want in zip(
+                DIFFERENTIABLE, (*inputs[:6], inputs[7]), (*six, backgrounds), strict=True
+            )
+            if tensor is not None and not want
+        )
         if ctx.absgrad and want_means2d:
             full, shown = torch.from_numpy(absolute).view(means2d.shape), ctx.info["means2d"]
             # As gsplat leaves it: an attribute, in the layout that the caller sees.

@@ -180,6 +180,27 @@ def test_tiles_without_gradient_are_skipped_and_counted():
     assert info["n_tiles_without_gradient"] == 16 - info["n_empty_tiles"] - 4
 
 
+def test_saturated_pixels_are_counted():
+    inputs = scene(n=4, channels=9, cameras=2)
+    inputs["scales"] = inputs["scales"] + 100
+    inputs["opacities"] = torch.ones_like(inputs["opacities"])
+    mask = torch.ones(2, 18, 23, dtype=torch.bool)
+    mask[1, :, 3:20] = False
+    assert rasterization(**inputs).info["n_saturated"] == mask.numel()
+    assert rasterization(**inputs, pixel_mask=mask).info["n_saturated"] == mask.sum()
+    endless = RasterSettings(min_transmittance=0)
+    assert rasterization(**inputs, settings=endless).info["n_saturated"] == 0
+
+
+def test_skipped_gradients_are_named():
+    inputs = scene(n=4)
+    for name in ("means", "colors", "backgrounds"):
+        inputs[name].requires_grad_()
+    colors, _, info = rasterization(**inputs)
+    colors.sum().backward()
+    assert info["gradients_skipped"] == ("quats", "scales", "opacities", "viewmats")
+
+
 def test_unpacks_as_three_values():
     colors, alphas, info = rasterization(**scene(cameras=2))
     assert colors.shape == (2, 18, 23, 3) and alphas.shape == (2, 18, 23, 1)

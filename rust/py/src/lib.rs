@@ -313,6 +313,7 @@ impl RasterState {
         dict.set_item("n_visible", counters.visible)?;
         dict.set_item("n_culled", counters.culled)?;
         dict.set_item("n_empty_tiles", counters.empty_tiles)?;
+        dict.set_item("n_saturated", counters.saturated)?;
         Ok(dict)
     }
 }

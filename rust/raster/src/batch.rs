@@ -151,6 +151,8 @@ pub struct Counters {
     pub culled: usize,
     /// Tiles that nothing reaches or that `pixel_mask` closes.
     pub empty_tiles: usize,
+    /// Pixels that stopped at `min_transmittance`: what lies behind is neither composited nor differentiated.
+    pub saturated: usize,
 }
 
 impl<T: Real> BatchState<T> {
@@ -168,6 +170,7 @@ impl<T: Real> BatchState<T> {
             visible: sum.visible + view.visible(),
             culled: sum.culled + view.culled(),
             empty_tiles: sum.empty_tiles + view.empty_tiles(),
+            saturated: sum.saturated + view.saturated(),
         })
     }
 }

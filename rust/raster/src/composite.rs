@@ -28,6 +28,8 @@ pub(crate) struct Canvas<T> {
     masks: Vec<u16>,
     /// Accumulated depth where the image has expected depth, else empty.
     depths: Vec<Lanes<T>>,
+    /// Pixels at which the light ended before the list did.
+    pub(crate) saturated: usize,
 }
 
 /// What all tiles of a view share.
@@ -50,6 +52,7 @@ impl<T> Default for Canvas<T> {
             end: Vec::new(),
             masks: Vec::new(),
             depths: Vec::new(),
+            saturated: 0,
         }
     }
 }
@@ -209,24 +212,31 @@ pub(crate) fn composite<T: Real>(
     let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
     // The kernel for the last group may have a channel more than is left.
     let planes = || vec![Lanes::ZERO; (total + 1) * scene.blocks()];
+    let saturated = AtomicUsize::new(0);
     strips
         .into_par_iter()
         .flat_map(|strip| rayon::iter::split(strip, |strip| strip.halves(scene)))
         .for_each_init(planes, |planes, mut strip| {
             while strip.tiles > 0 {
                 let tile = strip.take(scene, 1);
-                composite_tile(scene, &background, planes, tile);
+                saturated.fetch_add(
+                    composite_tile(scene, &background, planes, tile),
+                    Ordering::Relaxed,
+                );
             }
         });
+    out.saturated = saturated.into_inner();
     canvas
 }
 
+/// Composites one tile; returns how many of its pixels are saturated.
 fn composite_tile<T: Real>(
     scene: &Scene<'_, T>,
     background: &[T],
     planes: &mut [Lanes<T>],
     mut out: Strip<'_, T>,
-) {
+) -> usize {
+    let mut saturated = 0;
     let level = SimdLevel::detect();
     let blocks = scene.blocks();
     let total = scene.channels.total;
@@ -243,6 +253,8 @@ fn composite_tile<T: Real>(
                 transmittance: &mut *out.transmittance,
                 end: &mut *out.end,
                 masks: &mut *out.masks,
+                // The same for every group of channels.
+                saturated: &mut saturated,
             };
             dispatch::forward(level, &task, &open, tile_image);
             task.first += MAX_CHANNELS;
@@ -258,6 +270,7 @@ fn composite_tile<T: Real>(
         4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
         _ => write_tile(scene, background, planes, &mut out),
     }
+    saturated
 }
 
 /// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.

@@ -179,6 +179,10 @@ impl<T: Real> ViewState<T> {
         self.binned.bins.ranks.len()
     }
 
+    pub(crate) fn saturated(&self) -> usize {
+        self.canvas.saturated
+    }
+
     pub(crate) fn empty_tiles(&self) -> usize {
         self.binned
             .bins

@@ -18,6 +18,8 @@ pub(crate) struct TileImage<'a, T> {
     pub(crate) end: &'a mut [Lanes<T>],
     /// Blocks that each listed splat reaches, without blocks that have stopped.
     pub(crate) masks: &'a mut [u16],
+    /// How many pixels stopped before the light of all splats was counted.
+    pub(crate) saturated: &'a mut usize,
 }
 
 /// Some pixels of a block while light goes through them.
@@ -142,4 +144,13 @@ pub(crate) fn forward_tile<V: Vector, const K: usize>(
         batch += size;
     }
     out.masks[batch.min(task.ranks.len())..].fill(0);
+
+    let rendered: u32 = open[..blocks].iter().map(|bits| bits.count_ones()).sum();
+    let mut unstopped_pixels = 0;
+    for light in &unstopped[..blocks] {
+        for lane in (0..LANES).step_by(V::LANES) {
+            unstopped_pixels += V::bits(light.get::<V>(lane).above(rules.stop)).count_ones();
+        }
+    }
+    *out.saturated = (rendered - unstopped_pixels) as usize;
 }

@@ -92,6 +92,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
             transmittance: &mut transmittance,
             end: &mut end,
             masks: &mut masks,
+            saturated: &mut 0,
         };
         match runner {
             Runner::Level(level) => dispatch::forward(level, &task, &open, out),
