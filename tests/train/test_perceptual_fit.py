@@ -22,7 +22,7 @@ from bigs.types import Side
 
 def plan(**weights: float) -> RunConfig:
     """Two steps of the smoke preset's joint stage."""
-    joint = copy.deepcopy(SMOKE.stages[-1])
+    joint = copy.deepcopy(next(stage for stage in SMOKE.stages if stage.name == "joint"))
     return replace(SMOKE, stages=(replace(joint, steps=2, image_size=40, weights=weights),))
 
 
