@@ -130,8 +130,8 @@ _JOINT = OptimizeStage(
     frames_per_step=6,
 )
 
-# The object's print: many small Gaussians without a field, alone, at nearly the images' own size. SSIM is left
-# out: there it takes more time than all the rest.
+# The object's print: many small Gaussians without a field, alone, at nearly the images' own size. Without
+# SSIM, which would take more time there than all the rest.
 _OBJECT_DETAIL = OptimizeStage(
     name="object-detail",
     step="single-subject",

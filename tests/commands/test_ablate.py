@@ -95,8 +95,8 @@ def test_rows_as_they_are_asked_for() -> None:
 
 
 def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
-    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", "split"])
-    assert runs.made == ["full", "contact+smooth", "split"] and found.failed == []
+    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", "color"])
+    assert runs.made == ["full", "contact+smooth", "color"] and found.failed == []
     assert load_config(tmp_path / "out" / "full" / CONFIG) == SMOKE
     less = load_config(tmp_path / "out" / "contact+smooth" / CONFIG)
     assert less.initial.smooth_hands == 0.0
@@ -107,7 +107,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     assert rows["nothing", "bigs"][:6] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
     assert rows["contact + smooth", "bigs"][1] == "1.75"
     assert rows["", "paper"][0] == "96.55"  # of the row above it
-    assert rows["split", "bigs"][-1] == "this plan has nothing of split"
+    assert rows["color", "bigs"][-1] == "this plan has nothing of color"
     assert rows["initial estimates", "bigs"][1] == "1.50"
     assert "datasets differ" in found.table.note
 
