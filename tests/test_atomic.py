@@ -1,12 +1,13 @@
 """A file is the old one or the new one, whatever happens in between."""
 
+import errno
 import os
 import stat
 from pathlib import Path
 
 import pytest
 
-from bigs.atomic import atomic_write
+from bigs.atomic import atomic_write, remove_parts
 
 
 def names(folder: Path) -> list[str]:
@@ -75,6 +76,26 @@ def test_others_may_read_it_as_the_umask_says(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch) -> None:
+    def full(handle) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as caught, atomic_write(tmp_path / "a") as file:
+        file.write(b"x")
+    assert caught.value.filename == str(tmp_path / "a")
+    assert names(tmp_path) == []
+
+
+def test_what_killed_writers_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    for name in (".a.bin.x1.part", "sub/.b.bin.y2.part", "sub/b.bin", "part", ".hidden", "a.part"):
+        (tmp_path / name).write_bytes(b"x")
+    remove_parts(tmp_path)
+    assert names(tmp_path) == [".hidden", "a.part", "part", "sub"]
+    assert names(tmp_path / "sub") == ["b.bin"]
 
 
 def test_a_missing_folder_is_an_os_error(tmp_path: Path) -> None:

@@ -131,8 +131,9 @@ def test_the_configuration_can_be_run_again(finished_run: Run, tiny_clip: Path) 
 
 def test_the_log_has_every_step(finished_run: Run) -> None:
     events = [json.loads(line) for line in (finished_run.folder / "log.jsonl").read_text().splitlines()]
-    for index, stage in enumerate(PRESETS["smoke"].stages):
-        assert {"event": "stage", "stage": stage.name, "index": index, "stages": 6} in events
+    stages = PRESETS["smoke"].stages
+    for index, stage in enumerate(stages):
+        assert {"event": "stage", "stage": stage.name, "index": index, "stages": len(stages)} in events
         steps = [e for e in events if e["event"] == "step" and e["stage"] == stage.name]
         expected = stage.steps if isinstance(stage, OptimizeStage) else 0
         assert [e["step"] for e in steps] == list(range(1, expected + 1))
@@ -148,7 +149,8 @@ def test_the_log_has_every_step(finished_run: Run) -> None:
 
 def test_the_checkpoint_is_at_the_plans_end(finished_run: Run) -> None:
     with safe_open(finished_run.folder / "checkpoints" / "latest.safetensors", framework="np") as file:
-        assert json.loads(file.metadata()["position"]) == {"stage": 6, "step": None}
+        stages = len(PRESETS["smoke"].stages)
+        assert json.loads(file.metadata()["position"]) == {"stage": stages, "step": None}
         assert all(np.isfinite(file.get_tensor(key)).all() for key in file.keys())  # noqa: SIM118
 
 
@@ -372,6 +374,23 @@ def test_a_resumed_log_has_every_step_once(tiny_clip: Path, tmp_path: Path) -> N
     reconstruct(tiny_clip, tmp_path / "run", config, resume=True)
     events = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert [e["step"] for e in events if e["event"] == "step"] == [1, 2, 3, 4, 5, 6]
+
+
+def test_before_the_first_checkpoint_options_may_change(tiny_clip: Path, tmp_path: Path) -> None:
+    """What is run and what config.yaml says are one; there is nothing yet that could be lost."""
+    stage = replace(copy.deepcopy(PRESETS["smoke"].stages[0]), steps=2)
+    config = replace(PRESETS["smoke"], stages=(stage,))
+
+    def interrupt(event: dict[str, Any]) -> None:
+        if event["event"] == "step":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(tiny_clip, tmp_path / "run", config, listen=interrupt)
+    reconstruct(tiny_clip, tmp_path / "run", replace(config, seed=3), resume=True)
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["config"]["seed"] == 3
+    events = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [e["step"] for e in events if e["event"] == "step"] == [1, 2]
 
 
 # --- other clips and plans ---

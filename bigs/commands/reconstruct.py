@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 
 import bigs
+from bigs.atomic import remove_parts
 from bigs.checks import InputError
 from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
 from bigs.commands.run_folder import (
@@ -26,6 +26,7 @@ from bigs.commands.run_folder import (
     write_json,
     write_outputs,
 )
+from bigs.commands.run_log import RunLog
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.hold import load_hold
@@ -34,6 +35,7 @@ from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.image import psnr, ssim
 from bigs.metrics.report import comparison_table, evaluate
 from bigs.models.playback import Playback, record
+from bigs.train.checkpoint import FILE_NAME
 from bigs.train.config import RunConfig
 from bigs.train.config_file import save_config
 from bigs.train.fit import FitReport, check_plan, fit
@@ -54,7 +56,7 @@ class Outcome:
     run: Path
     table: list[tuple[str, ...]]  # scores; the first row is the heading
     report: FitReport
-    seconds: float
+    seconds: float  # with those of interrupted runs that this one continues
 
 
 def reconstruct(
@@ -96,22 +98,16 @@ def reconstruct(
     scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
 
     out.mkdir(parents=True, exist_ok=True)
-    if not (out / CONFIG).exists():
+    remove_parts(out)
+    # A checkpoint is refused unless it was made with this configuration; before there is one, options count.
+    if not (out / CHECKPOINTS / FILE_NAME).exists():
         save_config(out / CONFIG, config, run_origin(clip_path, hand_model))
-    log: list[dict[str, Any]] = read_log(out / LOG) if resume else []
-    with (out / LOG).open("a" if resume else "w") as file:
+    with RunLog(out / LOG, resume) as log:
 
         def log_and_listen(event: dict[str, Any]) -> None:
-            if event["event"] == "resume":
-                # What was logged after the checkpoint is done again.
-                log[:] = [row for row in log if _before(row, event)]
-                file.truncate(0)
-                file.writelines(json.dumps(row) + "\n" for row in log)
-                return
-            log.append(event)
-            file.write(json.dumps(event) + "\n")
-            file.flush()
-            listen(event)
+            log.add(event)
+            if event["event"] != "resume":
+                listen(event)
 
         scene, report = fit(
             clip,
@@ -131,8 +127,8 @@ def reconstruct(
             log_and_listen({"event": "skipped", "text": line})
     write_json(out / METRICS, scores)
     table = comparison_table(scores) + _image_rows(scores)
-    _write_preview(out, clip, playback, table, log, report)
-    return Outcome(out, table, report, time.perf_counter() - began)
+    _write_preview(out, clip, playback, table, log.events, report)
+    return Outcome(out, table, report, report.before + time.perf_counter() - began)
 
 
 def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:
@@ -143,24 +139,6 @@ def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None
         "clip": str(Path(clip_path).resolve()),
         "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
     }
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """The rows of a log; a last line that was cut off when the run was killed is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
-
-
-def _before(row: dict[str, Any], resume: dict[str, Any]) -> bool:
-    """Whether a logged event happened before the checkpoint that a run continues from."""
-    if "index" not in row:
-        return row["event"] != "skipped"
-    return (row["index"], row.get("step", 0)) <= (resume["index"], resume["step"])
 
 
 def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -> dict[str, float]:

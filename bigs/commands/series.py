@@ -11,8 +11,9 @@ from typing import Any
 import yaml
 
 from bigs.checks import InputError
-from bigs.commands.reconstruct import read_log, reconstruct, run_origin
+from bigs.commands.reconstruct import reconstruct, run_origin
 from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
+from bigs.commands.run_log import read_log
 from bigs.train.config import RunConfig
 from bigs.train.config_file import load_config
 from bigs.train.profile import profiled

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
@@ -16,7 +17,7 @@ from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
 from bigs.train.loop import NUMBERS, StageState
 
-FORMAT = "bigs-checkpoint-1"
+FORMAT = "bigs-checkpoint-2"
 FILE_NAME = "latest.safetensors"
 
 
@@ -25,9 +26,12 @@ class Position(NamedTuple):
 
     stage: int  # index of the stage to run next, or to continue
     resume: dict[str, Any] | None  # for `loop.run_stage`; None at a stage's start
+    report: dict[str, Any]  # as it was saved
 
 
-def save_checkpoint(folder: Path, scene: Scene, digest: str, stage: int, state: StageState | None) -> None:
+def save_checkpoint(
+    folder: Path, scene: Scene, digest: str, stage: int, state: StageState | None, report: dict[str, Any]
+) -> None:
     """Write the state after `state.step` steps of `stage`, or before its first when `state` is None.
 
     Args:
@@ -36,6 +40,7 @@ def save_checkpoint(folder: Path, scene: Scene, digest: str, stage: int, state: 
         digest: identifies clip, configuration and version; a checkpoint of another run is refused.
         stage: index in the plan.
         state: what `run_stage` passes to its hook.
+        report: plain data on what happened so far, kept for the report of the whole run.
     """
     tensors = {f"scene.{name}": value for name, value in scene.state_dict().items()}
     position: dict[str, Any] = {"stage": stage, "step": None}
@@ -43,10 +48,29 @@ def save_checkpoint(folder: Path, scene: Scene, digest: str, stage: int, state: 
         position |= {key: getattr(state, key) for key in NUMBERS}
         for index, moments in state.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
-    metadata = {"format": FORMAT, "digest": digest, "position": json.dumps(position)}
+    tensors = {name: value.contiguous() for name, value in tensors.items()}
+    metadata = {
+        "format": FORMAT,
+        "digest": digest,
+        "position": json.dumps(position),
+        "report": json.dumps(report),
+    }
+    metadata["checksum"] = _checksum(metadata, tensors)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / FILE_NAME) as file:
-        file.write(save({name: value.contiguous() for name, value in tensors.items()}, metadata))
+        file.write(save(tensors, metadata))
+
+
+def _checksum(metadata: dict[str, str], tensors: dict[str, Tensor]) -> str:
+    """Tells a file in which bits have changed from a whole one."""
+    total = 0
+    for key, text in sorted(metadata.items()):
+        if key != "checksum":
+            total = zlib.crc32(f"{key} {text}".encode(), total)
+    for name, value in sorted(tensors.items()):
+        total = zlib.crc32(f"{name} {value.dtype} {list(value.shape)}".encode(), total)
+        total = zlib.crc32(value.numpy().tobytes(), total)
+    return f"{total:08x}"
 
 
 def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
@@ -58,14 +82,17 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     path = folder / FILE_NAME
     if not path.exists():
         return None
+    damaged = f"{path}: expected a checkpoint, found a damaged file (remove it to start anew)"
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: expected a checkpoint, found a damaged file ({error})") from error
+        raise InputError(f"{damaged}: {error}") from error
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: expected format {FORMAT}, found {metadata.get('format')}")
+    if metadata.get("checksum") != _checksum(metadata, tensors):
+        raise InputError(f"{damaged}: its checksum is not that of its content")
     if metadata.get("digest") != digest:
         raise InputError(
             f"{path}: expected a checkpoint of this clip, hand model, configuration and version, "
@@ -76,13 +103,13 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     scene.load_state_dict(
         {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
     )
-    position = json.loads(metadata["position"])
+    position, report = json.loads(metadata["position"]), json.loads(metadata["report"])
     if position["step"] is None:
-        return Position(position["stage"], None)
-    moments: dict[int, dict[str, torch.Tensor]] = {}
+        return Position(position["stage"], None, report)
+    moments: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".")
             moments.setdefault(int(index), {})[key] = value
     resume = {key: position[key] for key in NUMBERS}
-    return Position(position["stage"], resume | {"moments": moments})
+    return Position(position["stage"], resume | {"moments": moments}, report)

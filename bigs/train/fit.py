@@ -48,6 +48,8 @@ class FitReport:
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
+    # Seconds of the interrupted runs that this one continues; they count in `seconds`, too.
+    before: float = 0.0
 
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
@@ -80,17 +82,14 @@ def fit(
         FloatingPointError: a loss became infinite or not a number.
     """
     report = FitReport()
-    config, note = _without_missing_network(config, perceptual)
-    if note:
-        listen({"event": "note", "stage": "start values", "text": note})
-        report.skipped.append(note)
+    config, network_note = _without_missing_network(config, perceptual)
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
     scene, notes = build_scene(
         clip, unknown, hand_models, config.initial, config.hand, config.object, config.lighting
     )
-    report.skipped += notes
+    report.skipped += [network_note, *notes] if network_note else notes
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
@@ -98,7 +97,16 @@ def fit(
     if position:
         done = position.resume["step"] if position.resume else 0
         listen({"event": "resume", "index": first, "step": done})
+        report = _continued(FitReport(**position.report), report)
+    elif network_note:
+        listen({"event": "note", "stage": "start values", "text": network_note})
     sources = _EvidenceSource(clip, unknown, scene, config, perceptual)
+
+    def keep(index: int, state: StageState | None) -> None:
+        """Save what has been reached; of the stage that runs or has just ended."""
+        report.seconds[stage.name] = time.perf_counter() - began
+        if checkpoints:
+            save_checkpoint(checkpoints, scene, digest, index, state, asdict(report))
 
     for index, stage in enumerate(config.stages):
         if index < first:
@@ -108,7 +116,7 @@ def fit(
             report.skipped.append(f"{stage.name}: {why}")
             continue
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
-        began = time.perf_counter()
+        began = time.perf_counter() - report.seconds.get(stage.name, 0.0)
         if isinstance(stage, ScaleSearchStage):
             factor, _, _ = search_object_scale(scene, stage, sources.touching, sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
@@ -125,18 +133,21 @@ def fit(
             listen({"event": "note", "stage": stage.name, "text": text})
         else:
             continues = position.resume if position and index == first else None
-            last = _optimise(
-                scene, stage, index, sources, config, continues, checkpoints, digest, report, listen
-            )
+            last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
             if last.step < stage.steps:
                 report.skipped.append(
                     f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had settled"
                 )
-        report.seconds[stage.name] = time.perf_counter() - began
-        if checkpoints:
-            save_checkpoint(checkpoints, scene, digest, index + 1, None)
+        keep(index + 1, None)
     scene.requires_grad_(False)
     return scene, report
+
+
+def _continued(saved: FitReport, started: FitReport) -> FitReport:
+    """The report of an interrupted run, to which the start values that were made once more are added."""
+    before = sum(saved.seconds.values())
+    seconds = {name: time + started.seconds.get(name, 0.0) for name, time in saved.seconds.items()}
+    return replace(saved, seconds=seconds, before=before)
 
 
 def _optimise(
@@ -146,15 +157,14 @@ def _optimise(
     sources: _EvidenceSource,
     config: RunConfig,
     resume: dict[str, Any] | None,
-    checkpoints: Path | None,
-    digest: str,
+    keep: Callable[[int, StageState | None], None],
     report: FitReport,
     listen: Listener,
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
         listen({"event": "step", "stage": stage.name, **progress._asdict(), "index": index})
-        if checkpoints and progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
-            save_checkpoint(checkpoints, scene, digest, index, state)
+        if progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
+            keep(index, state)
 
     def warn(text: str) -> None:
         listen({"event": "note", "stage": stage.name, "text": text})

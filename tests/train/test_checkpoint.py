@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import random
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -245,19 +246,63 @@ def test_a_truncated_checkpoint_is_named(
     assert str(tmp_path / FILE_NAME) in str(caught.value)
 
 
+def test_changed_bits_are_found(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:
+    """Anywhere: in the header, in numbers, in what is said of the run."""
+    scene = cube_scene(both_hands)
+    save_checkpoint(tmp_path, scene, "abc", 2, None, {"seconds": {"first": 1.5}})
+    whole = (tmp_path / FILE_NAME).read_bytes()
+    header = 8 + int.from_bytes(whole[:8], "little")
+    chance = random.Random(0)
+    places = [chance.randrange(header) for _ in range(30)] + [
+        chance.randrange(header, len(whole)) for _ in range(9)
+    ]
+    for place in [*places, whole.index(b"1.5"), len(whole) - 1]:
+        changed = bytearray(whole)
+        changed[place] ^= 1 << chance.randrange(8)
+        (tmp_path / FILE_NAME).write_bytes(changed)
+        with pytest.raises(InputError, match=r"latest\.safetensors: expected (a checkpoint, found|format)"):
+            load_checkpoint(tmp_path, scene, "abc")
+
+
+def test_an_interrupted_runs_report_is_whole(
+    tiny: Clip, both_hands: dict[Side, HandModel], tmp_path: Path
+) -> None:
+    """Seconds and skipped lines of stages that were over before the interruption."""
+    config = short_plan()
+    never = replace(config.stages[0], name="never", weights={})
+    config = replace(config, stages=(never, *config.stages))
+    _, expected = fit(tiny, both_hands, config)
+    assert "never: no loss term is left" in expected.skipped
+    report = None
+    for _ in range(9):
+        try:
+            _, report = fit(
+                tiny, both_hands, config, checkpoints=tmp_path, resume=True, listen=interrupt_after(6)
+            )
+        except Interrupted:
+            continue
+        break
+    assert report is not None
+    assert report.seconds.keys() == expected.seconds.keys()
+    assert list(report.seconds) == list(expected.seconds)
+    assert report.skipped == expected.skipped
+    assert 0 < report.before < sum(report.seconds.values())
+
+
 def test_another_format_is_named(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:
     save_file({"x": torch.zeros(1)}, tmp_path / FILE_NAME)
-    with pytest.raises(InputError, match="expected format bigs-checkpoint-1, found None"):
+    with pytest.raises(InputError, match="expected format bigs-checkpoint-2, found None"):
         load_checkpoint(tmp_path, cube_scene(both_hands), "digest")
 
 
 def test_what_a_checkpoint_holds(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:
     scene = cube_scene(both_hands)
-    save_checkpoint(tmp_path / "new" / "folder", scene, "abc", 2, None)
+    report = {"seconds": {"first": 1.5}, "skipped": ["a line"]}
+    save_checkpoint(tmp_path / "new" / "folder", scene, "abc", 2, None, report)
     with safe_open(tmp_path / "new" / "folder" / FILE_NAME, framework="pt") as file:
         assert {key.removeprefix("scene.") for key in file.keys()} == scene.state_dict().keys()  # noqa: SIM118
         assert json.loads(file.metadata()["position"]) == {"stage": 2, "step": None}
     other = cube_scene(both_hands)
-    assert load_checkpoint(tmp_path / "new" / "folder", other, "abc") == (2, None)
+    assert load_checkpoint(tmp_path / "new" / "folder", other, "abc") == (2, None, report)
     assert_same(other, scene.state_dict())
     assert load_checkpoint(tmp_path, other, "abc") is None
