@@ -244,6 +244,45 @@ def bench_engine(
     _print_tables(tables, out)
 
 
+def bench_reconstruct(
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("bench"),
+    presets: tuple[Preset, ...] = ("fast",),
+    without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    steps_limit: int = 0,
+    hand_model: Path | None = None,
+    frames: tuple[int, ...] = (15, 30, 60),
+    growth_steps: int = 6,
+    picture: bool = True,
+    threads: int = 0,
+) -> None:
+    """Time presets and switches over clips, with errors and where the time goes.
+
+    Args:
+        clips: clips; one that has its gt.npz is scored.
+        out: folder for the runs, reconstruct.md, .json and .png; finished runs are kept.
+        presets: what to run.
+        without: run the first preset without this, too (a name of reconstruct --without, or several joined
+            by +); repeatable.
+        steps_limit: presets with more steps are cut to about so many, and say so; 0 runs all.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        frames: numbers of frames for which the growth of the cost is measured.
+        growth_steps: steps of each stage for that; 0 measures no growth.
+        picture: draw the picture, which needs matplotlib.
+        threads: CPU threads; 0 takes all.
+    """
+    _use_threads(threads)
+    from bigs.bench.run_tables import BRIEF
+    from bigs.commands.bench_reconstruct import RunPlan
+    from bigs.commands.bench_reconstruct import bench_reconstruct as run
+
+    plan = RunPlan(clips, presets, without, steps_limit, hand_model, frames, growth_steps)
+    with _err.status("starting") as status:
+        found = run(plan, out, picture=picture, listen=status.update)
+    _print_tables([table for table in found.tables if table.title in BRIEF], out)
+    _fail_for(found.failed)
+
+
 Commands = Mapping[str, "Callable[..., None] | Commands"]
 
 COMMANDS: Commands = {
@@ -254,7 +293,7 @@ COMMANDS: Commands = {
     "render": render,
     "export": export,
     "ablate": ablate,
-    "bench": {"engine": bench_engine},
+    "bench": {"engine": bench_engine, "reconstruct": bench_reconstruct},
 }
 # What the help says of commands that have commands of their own.
 GROUPS = {"bench": "Measure how fast and how exact this is."}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from command_line import Answer, Run, run_bigs
+from fake_runs import FakeRuns
 
 from bigs.cli import main
 from bigs.data.base import Clip
@@ -49,6 +50,14 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_clip: Path) -> R
     folder = tmp_path_factory.mktemp("finished") / "run"
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
     return Run(folder, command, run_bigs(*command, "--out", folder))
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
+    """Series of runs without runs."""
+    fake = FakeRuns()
+    monkeypatch.setattr("bigs.commands.series.reconstruct", fake)
+    return fake
 
 
 @pytest.fixture

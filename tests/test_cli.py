@@ -20,7 +20,19 @@ from bigs.train.presets import PRESETS
 
 @pytest.mark.parametrize(
     "command",
-    ["", "demo", "info", "reconstruct", "eval", "render", "export", "bench", "bench engine"],
+    [
+        "",
+        "demo",
+        "info",
+        "reconstruct",
+        "eval",
+        "render",
+        "export",
+        "ablate",
+        "bench",
+        "bench engine",
+        "bench reconstruct",
+    ],
 )
 def test_help(call: Callable[..., Answer], command: str) -> None:
     answer = call(*command.split(), "--help")
@@ -36,7 +48,9 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "eval": "gt.npz",
         "info": "HANDS-challenge build folder",
         "bench": "Measure how fast",
+        "ablate": "beside the paper's Table 3",
         "bench engine": "runs of everything",
+        "bench reconstruct": "growth of the cost",
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:
         assert word in text

@@ -16,9 +16,15 @@ _RULES = {"exact": "float64, default thresholds", "every_pair": "float64, no thr
 _COLORS = ("#1b6ca8", "#c8553d", "#5b8c5a", "#8e6c8a", "#b8860b")
 
 
-def check_drawing() -> None:
-    """Raise `InputError` unless a picture can be drawn."""
-    _matplotlib()
+def check_drawing(option: str) -> Any:
+    """matplotlib.figure; raises `InputError` naming the option that asks for a picture if it is missing."""
+    try:
+        return importlib.import_module("matplotlib.figure")
+    except ImportError:
+        raise InputError(
+            f"{option}: expected matplotlib for the picture, found it is not installed "
+            "(pip install 'bigs[bench]')"
+        ) from None
 
 
 def draw_curve(report: dict[str, Any]) -> bytes:
@@ -27,7 +33,7 @@ def draw_curve(report: dict[str, Any]) -> bytes:
     Above against float64 with the default thresholds, below against float64 without any: what is exact by
     the rule that all renderers share need not be near what the rule leaves out.
     """
-    figure_module, ticker = _matplotlib(), importlib.import_module("matplotlib.ticker")
+    figure_module, ticker = check_drawing("--parts curve"), importlib.import_module("matplotlib.ticker")
     names = [name for name, workload in report["workloads"].items() if "curve" in workload]
     figure = figure_module.Figure(figsize=(3.3 * len(names) + 1.2, 6.2), dpi=100, layout="constrained")
     axes = figure.subplots(2, len(names), squeeze=False, sharex="col", sharey="row")
@@ -85,13 +91,3 @@ def _draw_peers(axis: Any, workload: dict[str, Any], rule: str) -> None:
             axis.plot(
                 [row["cpu"]], [max(error, _FLOOR)], marker, color="black", markersize=6, label=row["label"]
             )
-
-
-def _matplotlib() -> Any:
-    try:
-        return importlib.import_module("matplotlib.figure")
-    except ImportError:
-        raise InputError(
-            "--parts curve: expected matplotlib for the picture, found it is not installed "
-            "(pip install 'bigs[bench]')"
-        ) from None

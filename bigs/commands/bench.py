@@ -49,7 +49,7 @@ def bench_engine(
     plan = Plan(specs, threads, parts, peers, repeats, budget)
     check_plan(plan)
     if "curve" in parts:
-        check_drawing()
+        check_drawing("--parts curve")
     out.mkdir(parents=True, exist_ok=True)
     report = measure(plan, listen)
     tables = tables_of(report)

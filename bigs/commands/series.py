@@ -80,7 +80,7 @@ def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> Finis
 
     Returns:
         The outcome, or why there is none. `times` has "wall" and "cpu" (seconds in all), "resumed" (they are
-        of the last part only), and for each of "stages" its wall, cpu, steps, phases and rest.
+        of the last part only), and for each of "stages" its wall, cpu, steps, in_steps, phases and rest.
     """
     reused = (run.folder / TIMES).exists() and (run.folder / METRICS).exists()
     try:
@@ -118,6 +118,7 @@ def _run(run: PlannedRun, listen: Listener) -> None:
             "wall": stage.wall,
             "cpu": stage.cpu,
             "steps": stage.steps,
+            "in_steps": stage.in_steps,
             "phases": stage.phases,
             "rest": stage.rest,
         }

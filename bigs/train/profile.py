@@ -41,6 +41,7 @@ class StageTimes:
     wall: float = 0.0
     cpu: float = 0.0  # of all threads
     steps: int = 0
+    in_steps: float = 0.0  # wall seconds of the steps alone
     phases: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
 
     @property
@@ -66,6 +67,7 @@ class Profile:
             self.begin(name)
         if event["event"] == "step":
             self._current.steps += 1
+            self._current.in_steps += event["seconds"]
 
     def begin(self, name: str) -> None:
         """What follows belongs to stage `name`."""

@@ -3,68 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import Answer, assert_refused
+from fake_runs import FakeRuns
 
 from bigs.checks import InputError
-from bigs.commands import series
 from bigs.commands.ablate import Row, ablate, default_rows, parse_rows
-from bigs.commands.run_folder import CONFIG, LOG, METRICS, write_json
-from bigs.train.config import RunConfig
-from bigs.train.config_file import load_config, save_config
+from bigs.commands.run_folder import CONFIG
+from bigs.train.config_file import load_config
 from bigs.train.presets import PRESETS
 
 SMOKE = PRESETS["smoke"]
-SCORES = {
-    "mpjpe_ra_r": 9.0,
-    "mpjpe_ra_l": 8.0,
-    "cd_r_sq": 1.5,
-    "cd_l_sq": 2.5,
-    "cd_icp_sq": 0.5,
-    "f10_icp": 97.5,
-}
-
-
-class FakeRuns:
-    """Stands for `reconstruct`: writes what a run leaves behind, and counts."""
-
-    def __init__(self) -> None:
-        self.made: list[str] = []
-        self.fail: str | None = None
-
-    def __call__(
-        self,
-        clip: Path,
-        out: Path,
-        config: RunConfig,
-        *,
-        hand_model: Path | None,
-        ground_truth: Path | None,
-        resume: bool,
-        listen: Callable[[Mapping[str, Any]], None],
-    ) -> None:
-        assert resume == (out / CONFIG).exists()
-        self.made.append(out.name)
-        out.mkdir(exist_ok=True)
-        save_config(out / CONFIG, config, series.run_origin(clip, hand_model))
-        listen({"event": "stage", "stage": "joint", "index": 0, "stages": 1})
-        listen({"event": "step", "stage": "joint", "step": 1, "steps": 2})
-        if out.name == self.fail:
-            raise FloatingPointError("stage joint, step 1: image is not finite")
-        (out / LOG).write_text('{"event": "skipped", "text": "joint: 1 of 2 steps, the loss had settled"}\n')
-        write_json(out / METRICS, {"initial": SCORES, "result": SCORES | {"cd_r_sq": len(out.name) / 8}})
-
-
-@pytest.fixture
-def runs(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
-    fake = FakeRuns()
-    monkeypatch.setattr("bigs.commands.series.reconstruct", fake)
-    return fake
 
 
 def test_the_papers_rows() -> None:

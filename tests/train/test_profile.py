@@ -81,7 +81,7 @@ def test_a_stage_lasts_until_the_next(clock: Clock) -> None:
     profile.listen({"event": "stage", "stage": "one"})
     for _ in range(2):
         clock.now += 3.0
-        profile.listen({"event": "step", "stage": "one"})
+        profile.listen({"event": "step", "stage": "one", "seconds": 2.5})
     profile.listen({"event": "note", "stage": "outputs", "text": ""})
     profile.finish()
     one = profile.stages["one"]
@@ -89,7 +89,7 @@ def test_a_stage_lasts_until_the_next(clock: Clock) -> None:
         "one": 6.0,
         "outputs": 0.0,
     }
-    assert (one.steps, one.cpu, one.rest) == (2, 12.0, 6.0)
+    assert (one.steps, one.in_steps, one.cpu, one.rest) == (2, 5.0, 12.0, 6.0)
 
 
 def test_a_run_in_a_profile(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:

@@ -1,0 +1,50 @@
+"""A clip of other frames than it has: fewer, or more of them by going to and fro."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bigs.data.base import Clip
+
+
+def to_and_fro(available: int, count: int) -> np.ndarray:
+    """`count` indices [count] into `available` frames, forwards and backwards in turn: motion has no jump."""
+    there = np.arange(available)
+    period = np.concatenate([there, there[-2:0:-1]])
+    return np.resize(period, count)
+
+
+def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
+    """The clip with the given frames only, in that order; one that comes again keeps its name.
+
+    Args:
+        clip: the clip.
+        frames: [T'] indices of its frames.
+    """
+    hands = {
+        side: replace(
+            track,
+            global_orient=track.global_orient[frames],
+            hand_pose=track.hand_pose[frames],
+            transl=track.transl[frames],
+            valid=track.valid[frames],
+        )
+        for side, track in clip.hands.items()
+    }
+    obj = clip.object
+    if obj is not None:
+        obj = replace(
+            obj, rotations=obj.rotations[frames], transl=obj.transl[frames], valid=obj.valid[frames]
+        )
+    return replace(
+        clip,
+        frame_names=tuple(clip.frame_names[t] for t in frames),
+        image_paths=tuple(clip.image_paths[t] for t in frames),
+        mask_paths=tuple(clip.mask_paths[t] for t in frames),
+        cam_from_world=clip.cam_from_world[frames],
+        hands=hands,
+        object=obj,
+        mask_areas={entity: areas[frames] for entity, areas in clip.mask_areas.items()},
+    )
