@@ -10,6 +10,7 @@ from bigs.commands.reconstruct import run_origin
 from bigs.commands.run_folder import CONFIG, LOG, METRICS, write_json
 from bigs.train.config import RunConfig
 from bigs.train.config_file import save_config
+from bigs.train.switches import SWITCHES, without
 
 SCORES = {
     "mpjpe_ra_r": 9.0,
@@ -19,6 +20,11 @@ SCORES = {
     "cd_icp_sq": 0.5,
     "f10_icp": 97.5,
 }
+
+
+def idle_switch(config: RunConfig) -> str:
+    """A switch of something that a plan has not."""
+    return next(name for name in SWITCHES if without(config, name) == config)
 
 
 class FakeRuns:

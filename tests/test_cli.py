@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from command_line import Answer, assert_refused, run_bigs
+from fake_runs import idle_switch
 
 import bigs
 from bigs.checks import InputError
@@ -96,13 +97,13 @@ def test_ingredients_are_left_out(
         return Outcome(out, [("score", "unit", "result")], FitReport(), 0.0)
 
     monkeypatch.setattr("bigs.commands.reconstruct.reconstruct", run)
-    options = ["--preset", "fast", "--set", "seed=3", "--without", "share", "--without", "offset"]
+    idle = idle_switch(PRESETS["fast"])
+    options = ["--preset", "fast", "--set", "seed=3", "--without", "share", "--without", idle]
     answer = call("reconstruct", tmp_path, "--out", tmp_path / "out", *options)
     assert answer.code == 0, answer.err
     fast = replace(PRESETS["fast"], seed=3)
     assert given == [replace(fast, hand=replace(fast.hand, shared=False))]
-    # No preset uses the term offset.
-    assert "--without offset: this plan has nothing of it" in answer.out
+    assert f"--without {idle}: this plan has nothing of it" in answer.out
     assert "--without share" not in answer.out
 
 

@@ -144,45 +144,38 @@ def ablate(
 
 
 def ablation_table(rows: list[Row], done: dict[str, FinishedRun], unused: dict[str, list[str]]) -> Table:
-    """Two lines a row where the paper has it: ours and the paper's."""
-    heading = (
-        "without",
-        "whose",
-        *(f"{METRICS[key].paper}, {METRICS[key].unit}" for key in _SCORES),
-        "s",
-        "note",
-    )
+    """Scores of every row that was run, and below them the paper's where it has the row."""
+    heading = ("without", *(f"{METRICS[key].paper} {METRICS[key].unit}" for key in _SCORES), "s")
+    nothing = ("",) * (len(_SCORES) + 1)
     body: list[tuple[str, ...]] = []
-    if "prior" in _missing():
-        body += [
-            ("nothing, with prior", "bigs", *("",) * (len(_SCORES) + 1), NO_PRIOR),
-            ("", "paper", *map("{:.2f}".format, _PAPER[frozenset()]), "", ""),
-        ]
-    initial = next((run.scores["initial"] for run in done.values() if "initial" in run.scores), None)
-    for row in rows:
-        label = " + ".join(row.off) or "nothing"
-        if row.name in done:
-            body.append((label, "bigs", *_cells(done[row.name], unused[row.name])))
-            label = ""
-        if row.paper is not None:
-            body.append((label, "paper", *map("{:.2f}".format, row.paper), "", ""))
-    if initial is not None:
-        body.append(("initial estimates", "bigs", *(_score(initial, key) for key in _SCORES), "", ""))
-    note = (
+    notes = [
         "The datasets differ: the paper's figures are means over nine clips of ARCTIC, ours of this clip; "
         "only the direction of a change compares. CD is squared, as in the paper."
-    )
-    return Table("Ablation", note, [heading, *body])
+    ]
+    if "prior" in _missing():
+        body += [(f"nothing, with prior ({NO_PRIOR})", *nothing), _paper_cells(_PAPER[frozenset()])]
+    for row in rows:
+        label = " + ".join(row.off) or "nothing"
+        run = done.get(row.name)
+        if run is not None and run.failure:
+            body.append((label, *nothing))
+            notes.append(f"{label} failed: {run.failure}.")
+        elif run is not None:
+            resumed = run.times["resumed"]
+            seconds = "-" if resumed else f"{run.times['wall']:.0f}"
+            body.append((label, *(_score(run.scores["result"], key) for key in _SCORES), seconds))
+            notes += [f"{label}: continued after an interruption, not timed."] if resumed else []
+            notes += [f"{label}: this plan has nothing of {name}." for name in unused[row.name]]
+        if row.paper is not None:
+            body.append(_paper_cells(row.paper))
+    initial = next((run.scores["initial"] for run in done.values() if "initial" in run.scores), None)
+    if initial is not None:
+        body.append(("initial estimates", *(_score(initial, key) for key in _SCORES), ""))
+    return Table("Ablation", " ".join(notes), [heading, *body])
 
 
-def _cells(run: FinishedRun, unused: list[str]) -> tuple[str, ...]:
-    if run.failure:
-        return (*("",) * (len(_SCORES) + 1), f"failed: {run.failure}")
-    notes = [f"this plan has nothing of {name}" for name in unused]
-    resumed = run.times["resumed"]
-    notes += ["continued after an interruption, not timed"] if resumed else []
-    seconds = "" if resumed else f"{run.times['wall']:.0f}"
-    return (*(_score(run.scores["result"], key) for key in _SCORES), seconds, "; ".join(notes))
+def _paper_cells(scores: tuple[float, ...]) -> tuple[str, ...]:
+    return ("(the paper)", *map("{:.2f}".format, scores), "")
 
 
 def _score(scores: dict[str, float], key: str) -> str:

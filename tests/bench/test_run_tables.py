@@ -14,7 +14,7 @@ PHASES = ("fields", "engine")
 
 
 def stage(steps: int, each: float, fields: float = 0.0) -> dict[str, Any]:
-    """`steps` steps of `each` seconds, of which `fields` in fields and the same in the engine; 1 s besides."""
+    """`steps` steps of `each` seconds, `fields` of them in fields and the same in the engine."""
     wall = steps * each + 1.0
     phases = dict.fromkeys(PHASES, steps * fields)
     rest = wall - 2 * steps * fields

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from command_line import Answer, assert_refused
-from fake_runs import FakeRuns
+from fake_runs import FakeRuns, idle_switch
 
 from bigs.checks import InputError
 from bigs.commands.ablate import Row, ablate, default_rows, parse_rows
@@ -48,28 +48,39 @@ def test_rows_as_they_are_asked_for() -> None:
 
 
 def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
-    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", "color"])
-    assert runs.made == ["full", "contact+smooth", "color"] and found.failed == []
+    idle = idle_switch(SMOKE)
+    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", idle])
+    assert runs.made == ["full", "contact+smooth", idle] and found.failed == []
     assert load_config(tmp_path / "out" / "full" / CONFIG) == SMOKE
     less = load_config(tmp_path / "out" / "contact+smooth" / CONFIG)
     assert less.initial.smooth_hands == 0.0
     assert not any("contact" in stage.weights for stage in less.stages if hasattr(stage, "weights"))
 
-    rows = {(row[0], row[1]): row[2:] for row in found.table.rows}
-    assert rows["nothing, with prior", "bigs"][-1] == "off: no diffusion prior in this version"
-    assert rows["nothing", "bigs"][:6] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
-    assert rows["contact + smooth", "bigs"][1] == "1.75"
-    assert rows["", "paper"][0] == "96.55"  # of the row above it
-    assert rows["color", "bigs"][-1] == "this plan has nothing of color"
-    assert rows["initial estimates", "bigs"][1] == "1.50"
+    rows = found.table.rows
+    assert rows[0][:3] == ("without", "CD_l cm²", "CD_r cm²")
+    assert [row[0] for row in rows[1:]] == [
+        "nothing, with prior (off: no diffusion prior in this version)",
+        "(the paper)",
+        "nothing",
+        "(the paper)",
+        "contact + smooth",
+        "(the paper)",
+        idle,
+        "initial estimates",
+    ]
+    assert rows[1][1:] == ("",) * 7
+    assert rows[3][1:7] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
+    assert rows[4][1] == "50.78" and rows[6][1] == "96.55"
+    assert rows[5][2] == "1.75" and rows[8][2] == "1.50"
     assert "datasets differ" in found.table.note
+    assert f"{idle}: this plan has nothing of {idle}." in found.table.note
 
     page = (tmp_path / "out" / "ablation.md").read_text()
-    assert page.count("| paper |") == 3 and "datasets differ" in page
+    assert page.count("| (the paper) |") == 3 and "datasets differ" in page
     numbers = {
         row["row"]: row for row in json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
     }
-    assert list(numbers) == ["full", "contact+smooth", "split"]
+    assert list(numbers) == ["full", "contact+smooth", idle]
     assert numbers["full"]["paper"]["cd_l_sq"] == 50.78
     assert numbers["full"]["scores"]["result"]["cd_r_sq"] == 0.5
     assert numbers["full"]["times"]["stages"]["joint"]["steps"] == 1
@@ -80,14 +91,15 @@ def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path:
     runs.fail = "share"
     found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["share", "smooth"])
     assert found.failed == ["share"]
-    (row,) = [row for row in found.table.rows if row[0] == "share"]
-    assert "failed: FloatingPointError: stage joint, step 1" in row[-1]
+    assert ("share", *("",) * 7) in found.table.rows
+    assert "share failed: FloatingPointError: stage joint, step 1" in found.table.note
     (other,) = [row for row in found.table.rows if row[0] == "smooth"]
-    assert other[3] == "0.75"
+    assert other[2] == "0.75"
 
     runs.fail, runs.made = None, []
     again = ablate(tiny_clip, tmp_path / "out", SMOKE, ["share", "smooth"])
     assert runs.made == ["share"] and again.failed == []
+    assert "failed" not in again.table.note
     assert [row for row in again.table.rows if row[0] == "smooth"] == [other]
 
 

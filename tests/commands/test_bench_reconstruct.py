@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from command_line import Answer, assert_refused
-from fake_runs import FakeRuns
+from fake_runs import FakeRuns, idle_switch
 
 from bigs.checks import InputError
 from bigs.commands.bench_reconstruct import RunPlan, bench_reconstruct, variants
@@ -29,19 +29,20 @@ SMOKE = PRESETS["smoke"]
 
 
 def test_variants() -> None:
-    plan = RunPlan((), ("smoke", "paper", "smoke"), ("share", "split+smooth"), steps_limit=750)
+    idle = idle_switch(SMOKE)
+    plan = RunPlan((), ("smoke", "paper", "smoke"), ("share", f"{idle}+smooth"), steps_limit=750)
     found = variants(plan)
     assert [v.label for v in found] == [
         "smoke",
         "paper (750 of 75000 steps)",
         "smoke without share",
-        "smoke without split, smooth",
+        f"smoke without {idle}, smooth",
     ]
     assert found[1].folder == "paper-750-steps"
     assert planned_steps(found[1].config) == {"hands": 150, "object": 300, "translations": 300}
     assert found[1].whole == PRESETS["paper"]
     assert not found[2].config.hand.shared
-    assert found[3].unused == ("split",)
+    assert found[3].unused == (idle,)
     assert len({v.folder for v in found}) == len(found)
 
 
