@@ -17,10 +17,14 @@ use crate::project::{Lens, ScreenInfo, Splat};
 use crate::real::Real;
 use crate::settings::{Limits, RasterSettings, RenderMode};
 use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, bin_tiles};
+use crate::vector::prefetch;
 
 /// (Gaussian, tile) pairs that are listed while projecting. With more, the rest is first only counted: should they be
 /// more than can be numbered, that is to be said before they fill the memory.
 const PATIENCE: usize = 1 << 26;
+
+/// Slots that are asked for ahead of the one being summed.
+const AHEAD: usize = 16;
 
 /// Everything one image is made of.
 #[derive(Clone, Copy, Debug)]
@@ -304,6 +308,14 @@ impl<T: Real> Slots<'_, T> {
         sums
     }
 
+    /// Asks for the memory of a slot.
+    #[inline(always)]
+    fn prefetch(&self, position: u32) {
+        let first = position as usize * self.size();
+        prefetch(self.values, first);
+        prefetch(self.values, first + self.size() - 1);
+    }
+
     /// Sums the slots of one Gaussian, tile by tile. Adds the gradients of its colours to `colors` (none if empty);
     /// returns the moments and the gradient of depth as a channel.
     #[inline(always)]
@@ -437,10 +449,15 @@ pub(crate) fn project_view_vjp<T: Real>(
             |(chunk, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
                 let mut v = ChunkGradients::new();
                 for local in 0..cover.len() {
-                    let own = &positions[cover.pairs_of(local)];
+                    let own = cover.pairs_of(local);
                     if own.is_empty() {
                         continue;
                     }
+                    // Slots lie tile by tile: one Gaussian's, and the next one's, are far apart.
+                    for &position in positions.iter().skip(own.start + AHEAD).take(own.len()) {
+                        slots.prefetch(position);
+                    }
+                    let own = &positions[own];
                     let v_colors = if colors.is_empty() {
                         &mut []
                     } else {

@@ -5,7 +5,7 @@ use super::{
     TileTask, WORD, falloff,
 };
 use crate::real::Real;
-use crate::vector::Vector;
+use crate::vector::{MAX_SUMS, Vector};
 
 /// What backward needs of a tile's pixels, in block order.
 pub(crate) struct TileCotangents<'a, T> {
@@ -95,11 +95,49 @@ impl<V: Vector, const K: usize> Sums<V, K> {
             self.absolutes = [x.plus(absolute(hu)), y.plus(absolute(along_y))];
         }
     }
+
+    /// The moments, then the gradients of the K channels, then the absolutes.
+    #[inline(always)]
+    fn reduced<const ABSOLUTE: bool>(&self) -> [V::Scalar; MAX_SUMS] {
+        let mut all = [V::splat(V::Scalar::ZERO); MAX_SUMS];
+        all[..MOMENTS].copy_from_slice(&self.moments);
+        all[MOMENTS..MOMENTS + K].copy_from_slice(&self.v_values);
+        if ABSOLUTE {
+            all[MOMENTS + K..][..ABSOLUTES].copy_from_slice(&self.absolutes);
+        }
+        V::sums(&all)
+    }
+}
+
+/// Writes what [`Sums::reduced`] yields into a slot. Channels after the first group add to the moments and the
+/// absolutes.
+#[inline(always)]
+fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
+    task: &TileTask<'_, T>,
+    slot: &mut [T],
+    sums: &[T; MAX_SUMS],
+) {
+    let total = task.channels.total;
+    if !ABSOLUTE && total == K && task.first == 0 {
+        // As the general case, with a length that the compiler knows: no calls to copy a few bytes.
+        slot[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
+        return;
+    }
+    let used = (total - task.first).min(K);
+    let (moments, rest) = slot.split_at_mut(MOMENTS);
+    let (v_values, absolutes) = rest.split_at_mut(total);
+    v_values[task.first..][..used].copy_from_slice(&sums[MOMENTS..][..used]);
+    let kept = |sum: T| if task.first == 0 { T::ZERO } else { sum };
+    for (sum, &m) in moments.iter_mut().zip(sums) {
+        *sum = kept(*sum) + m;
+    }
+    for (sum, &a) in absolutes.iter_mut().zip(&sums[MOMENTS + K..]) {
+        *sum = kept(*sum) + a;
+    }
 }
 
 /// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`stride` values
-/// each: the moments, then all channels, then the absolutes if ABSOLUTE). Channels after the first group add to the
-/// moments and the absolutes.
+/// each: the moments, then all channels, then the absolutes if ABSOLUTE).
 #[inline(always)]
 pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, V::Scalar>,
@@ -109,7 +147,6 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
 ) {
     let zero = V::Scalar::ZERO;
     let blocks = task.side * task.side;
-    let used = (task.channels.total - task.first).min(K);
     let centres = PixelCentres::new(task);
     let mut state = [Block {
         x: Lanes::ZERO,
@@ -175,15 +212,8 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
             }
             let mut rest = mask & active;
             let slot = &mut slots[(batch + i) * stride..][..stride];
-            let (moments, v_values) = slot.split_at_mut(MOMENTS);
-            let (v_values, absolutes) = v_values.split_at_mut(task.channels.total);
-            let v_values = &mut v_values[task.first..][..used];
             if rest == 0 {
-                if task.first == 0 {
-                    moments.fill(zero);
-                    absolutes.fill(zero);
-                }
-                v_values.fill(zero);
+                write::<V::Scalar, K, ABSOLUTE>(task, slot, &[zero; MAX_SUMS]);
                 continue;
             }
             let entry = &entries[i];
@@ -199,22 +229,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
                     sums.add::<ABSOLUTE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
                 }
             }
-            let m = V::sums(&sums.moments);
-            let c = V::sums(&sums.v_values);
-            if task.first == 0 {
-                moments.copy_from_slice(&m[..MOMENTS]);
-            } else {
-                for (sum, m) in moments.iter_mut().zip(m) {
-                    *sum += m;
-                }
-            }
-            v_values.copy_from_slice(&c[..used]);
-            if ABSOLUTE {
-                let a = V::sums(&sums.absolutes);
-                for (sum, a) in absolutes.iter_mut().zip(a) {
-                    *sum = if task.first == 0 { a } else { *sum + a };
-                }
-            }
+            write::<V::Scalar, K, ABSOLUTE>(task, slot, &sums.reduced::<ABSOLUTE>());
         }
     }
 }
