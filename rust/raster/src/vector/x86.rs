@@ -532,39 +532,54 @@ impl Vector for F32x16 {
     }
     #[inline(always)]
     fn sums<const N: usize>(vectors: &[Self; N]) -> [f32; MAX_SUMS] {
-        macro_rules! fold {
-            ($first:literal) => {
-                fold4!(
-                    vectors,
-                    $first,
-                    N,
-                    _mm512_unpacklo_ps,
-                    _mm512_unpackhi_ps,
-                    _mm512_unpacklo_pd,
-                    _mm512_unpackhi_pd,
-                    _mm512_add_ps,
-                    _mm512_setzero_ps,
-                    _mm512_castps_pd,
-                    _mm512_castpd_ps
-                )
-            };
-        }
-        let (a, b, c, d) = (fold!(0), fold!(4), fold!(8), fold!(12));
-        // The same once more, with 128-bit parts for lanes.
-        let all = op!({
-            let ab = _mm512_add_ps(
-                _mm512_shuffle_f32x4::<0b10_00_10_00>(a, b),
-                _mm512_shuffle_f32x4::<0b11_01_11_01>(a, b),
-            );
-            let cd = _mm512_add_ps(
-                _mm512_shuffle_f32x4::<0b10_00_10_00>(c, d),
-                _mm512_shuffle_f32x4::<0b11_01_11_01>(c, d),
-            );
-            _mm512_add_ps(
-                _mm512_shuffle_f32x4::<0b10_00_10_00>(ab, cd),
-                _mm512_shuffle_f32x4::<0b11_01_11_01>(ab, cd),
-            )
-        });
+        let at = |i: usize| {
+            if i < N {
+                vectors[i].0
+            } else {
+                op!(_mm512_setzero_ps())
+            }
+        };
+        // Two vectors become one, half as many lanes for each: of two pieces that are added, a blend makes one, which
+        // runs where a shuffle, the scarce one, does not.
+        let by_8 = |a, b| {
+            op!(_mm512_add_ps(
+                _mm512_mask_blend_ps(0xFF00, a, b),
+                _mm512_shuffle_f32x4::<0b01_00_11_10>(a, b)
+            ))
+        };
+        let by_4 = |a, b| {
+            let swapped = op!(_mm512_setr_epi32(
+                4, 5, 6, 7, 16, 17, 18, 19, 12, 13, 14, 15, 24, 25, 26, 27
+            ));
+            op!(_mm512_add_ps(
+                _mm512_mask_blend_ps(0xF0F0, a, b),
+                _mm512_permutex2var_ps(a, swapped, b)
+            ))
+        };
+        let by_2 = |a, b| {
+            op!(_mm512_add_ps(
+                _mm512_mask_blend_ps(0xCCCC, a, b),
+                _mm512_shuffle_ps::<0b01_00_11_10>(a, b)
+            ))
+        };
+        let by_1 = |a, b| {
+            let swapped = op!(_mm512_setr_epi32(
+                1, 16, 3, 18, 5, 20, 7, 22, 9, 24, 11, 26, 13, 28, 15, 30
+            ));
+            op!(_mm512_add_ps(
+                _mm512_mask_blend_ps(0xAAAA, a, b),
+                _mm512_permutex2var_ps(a, swapped, b)
+            ))
+        };
+        let two = |i: usize| by_8(at(i), at(i + 1));
+        let four = |i: usize| by_4(two(i), two(i + 2));
+        let eight = |i: usize| by_2(four(i), four(i + 4));
+        let all = by_1(eight(0), eight(8));
+        // Each vector's sum is now in the lane that its number, its four bits backwards, tells.
+        let order = op!(_mm512_setr_epi32(
+            0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15
+        ));
+        let all = op!(_mm512_permutexvar_ps(order, all));
         let mut sums = [0.0; MAX_SUMS];
         Self(all).store(&mut sums);
         sums
