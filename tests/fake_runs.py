@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bigs.commands.reconstruct import run_origin
-from bigs.commands.run_folder import CONFIG, LOG, METRICS, write_json
+from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
 from bigs.train.config import RunConfig
 from bigs.train.config_file import save_config
 from bigs.train.switches import SWITCHES, without
@@ -55,6 +55,7 @@ class FakeRuns:
         listen({"event": "stage", "stage": "joint", "index": 0, "stages": 1})
         listen({"event": "step", "stage": "joint", "step": 1, "steps": 2, "seconds": 0.5})
         if out.name == self.fail:
+            (out / CHECKPOINTS).mkdir()
             raise FloatingPointError("stage joint, step 1: image is not finite")
         (out / LOG).write_text('{"event": "skipped", "text": "joint: 1 of 2 steps, the loss had settled"}\n')
         write_json(out / METRICS, {"initial": SCORES, "result": SCORES | {"cd_r_sq": len(out.name) / 8}})

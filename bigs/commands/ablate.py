@@ -153,7 +153,8 @@ def ablation_table(rows: list[Row], done: dict[str, FinishedRun], unused: dict[s
         "only the direction of a change compares. CD is squared, as in the paper."
     ]
     if "prior" in _missing():
-        body += [(f"nothing, with prior ({NO_PRIOR})", *nothing), _paper_cells(_PAPER[frozenset()])]
+        body += [("with prior: off", *nothing), _paper_cells(_PAPER[frozenset()])]
+        notes.append(f"with prior: {NO_PRIOR}.")
     for row in rows:
         label = " + ".join(row.off) or "nothing"
         run = done.get(row.name)

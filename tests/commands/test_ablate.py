@@ -59,7 +59,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     rows = found.table.rows
     assert rows[0][:3] == ("without", "CD_l cm²", "CD_r cm²")
     assert [row[0] for row in rows[1:]] == [
-        "nothing, with prior (off: no diffusion prior in this version)",
+        "with prior: off",
         "(the paper)",
         "nothing",
         "(the paper)",
@@ -73,6 +73,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     assert rows[4][1] == "50.78" and rows[6][1] == "96.55"
     assert rows[5][2] == "1.75" and rows[8][2] == "1.50"
     assert "datasets differ" in found.table.note
+    assert "with prior: off: no diffusion prior in this version." in found.table.note
     assert f"{idle}: this plan has nothing of {idle}." in found.table.note
 
     page = (tmp_path / "out" / "ablation.md").read_text()
@@ -100,6 +101,11 @@ def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path:
     again = ablate(tiny_clip, tmp_path / "out", SMOKE, ["share", "smooth"])
     assert runs.made == ["share"] and again.failed == []
     assert "failed" not in again.table.note
+    # It went on from its checkpoint: what that took does not say what the row costs.
+    assert "share: continued after an interruption, not timed." in again.table.note
+    assert {row[0]: row[-1] for row in again.table.rows[3:]} == {
+        "nothing": "0", "(the paper)": "", "share": "-", "smooth": "0", "initial estimates": ""
+    }  # fmt: skip
     assert [row for row in again.table.rows if row[0] == "smooth"] == [other]
 
 
