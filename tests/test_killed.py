@@ -14,6 +14,7 @@ import pytest
 from command_line import contents
 from forked import KILLED, Death, Nursery
 
+from bigs.commands.run_lock import only_writer
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.types import Side
@@ -23,7 +24,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reas
 # What must be the same; the rest holds times.
 RESULTS = ("scene.safetensors", "poses.npz", "gaussians/hand.ply", "meshes/object.ply", "metrics.json")
 # The smoke preset in few steps, and a checkpoint every other step.
-STEPS = {"hands-coarse": 6, "hands-fine": 3, "held": 3, "appearance": 3, "contact": 3, "joint": 4}
+STEPS = {
+    "hands-coarse": 6,
+    "hands-fine": 3,
+    "held": 3,
+    "appearance": 3,
+    "contact": 3,
+    "joint": 4,
+    "object-detail": 3,
+}
 QUICK = [
     f"--set=stages.{stage}.{change}"
     for stage, n in STEPS.items()
@@ -88,7 +97,7 @@ def test_killed_at_random_moments(
     nursery: Nursery, command: list[str], undisturbed: Undisturbed, tmp_path: Path
 ) -> None:
     chance, out, kills = random.Random(4), tmp_path / "run", 0
-    until = time.monotonic() + 2.5 * undisturbed.seconds
+    until = time.monotonic() + 1.5 * undisturbed.seconds
     while time.monotonic() < until and kills < 25:
         pid = nursery.start(*command, "--out", out, "--resume", output=tmp_path / "said")
         time.sleep(chance.uniform(0.0, 0.7) * undisturbed.seconds)
@@ -98,8 +107,20 @@ def test_killed_at_random_moments(
         kills += code == KILLED
         if code == 0:
             break
-    assert kills >= 3
+    assert kills >= 2
     finish(nursery, command, out, undisturbed)
+
+
+def test_two_do_not_work_on_one_run(
+    nursery: Nursery, command: list[str], undisturbed: Undisturbed, tmp_path: Path
+) -> None:
+    out, said = tmp_path / "run", tmp_path / "said"
+    out.mkdir()
+    with only_writer(out):
+        nursery.start(*command, "--out", out, "--resume", output=said)
+        assert nursery.ended() == 2
+    assert "run: expected a run that rests, found another process at it" in said.read_text()
+    assert list(out.iterdir()) == []
 
 
 def test_killed_at_every_kind_of_rename(
@@ -108,7 +129,7 @@ def test_killed_at_every_kind_of_rename(
     """The instants that matter most: a file is complete beside its place, or has just taken it."""
     chance, out = random.Random(5), tmp_path / "run"
     # So many renames after which a process dies, that the run reaches its outputs and dies among them.
-    for attempt, count in enumerate((1, 3, 6, 2, 12, 4, 9)):
+    for attempt, count in enumerate((1, 4, 9, 3, 12, 8)):
         death = Death(count, renamed=chance.random() < 0.5)
         nursery.start(*command, "--out", out, "--resume", output=tmp_path / "said", death=death)
         assert nursery.ended() == KILLED, f"attempt {attempt}: {(tmp_path / 'said').read_text()}"

@@ -26,6 +26,7 @@ from bigs.commands.run_folder import (
     write_json,
     write_outputs,
 )
+from bigs.commands.run_lock import only_writer
 from bigs.commands.run_log import RunLog
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_ground_truth
@@ -98,37 +99,38 @@ def reconstruct(
     scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
 
     out.mkdir(parents=True, exist_ok=True)
-    remove_parts(out)
-    # A checkpoint is refused unless it was made with this configuration; before there is one, options count.
-    if not (out / CHECKPOINTS / FILE_NAME).exists():
-        save_config(out / CONFIG, config, run_origin(clip_path, hand_model))
-    with RunLog(out / LOG, resume) as log:
+    with only_writer(out):
+        remove_parts(out)
+        # A checkpoint of another configuration is refused; before there is one, the options count.
+        if not (out / CHECKPOINTS / FILE_NAME).exists():
+            save_config(out / CONFIG, config, run_origin(clip_path, hand_model))
+        with RunLog(out / LOG, resume) as log:
 
-        def log_and_listen(event: dict[str, Any]) -> None:
-            log.add(event)
-            if event["event"] != "resume":
-                listen(event)
+            def log_and_listen(event: dict[str, Any]) -> None:
+                log.add(event)
+                if event["event"] != "resume":
+                    listen(event)
 
-        scene, report = fit(
-            clip,
-            hand_models,
-            config,
-            perceptual=network,
-            checkpoints=out / CHECKPOINTS,
-            resume=resume,
-            listen=log_and_listen,
-        )
-        playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
-        listen({"event": "note", "stage": "outputs", "text": "writing results"})
-        write_outputs(out, playback)
-        result = _score(clip, playback, truth)
-        scores["result"] = result
-        for line in report.skipped:
-            log_and_listen({"event": "skipped", "text": line})
-    write_json(out / METRICS, scores)
-    table = comparison_table(scores) + _image_rows(scores)
-    _write_preview(out, clip, playback, table, log.events, report)
-    return Outcome(out, table, report, report.before + time.perf_counter() - began)
+            scene, report = fit(
+                clip,
+                hand_models,
+                config,
+                perceptual=network,
+                checkpoints=out / CHECKPOINTS,
+                resume=resume,
+                listen=log_and_listen,
+            )
+            playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
+            listen({"event": "note", "stage": "outputs", "text": "writing results"})
+            write_outputs(out, playback)
+            result = _score(clip, playback, truth)
+            scores["result"] = result
+            for line in report.skipped:
+                log_and_listen({"event": "skipped", "text": line})
+        write_json(out / METRICS, scores)
+        table = comparison_table(scores) + _image_rows(scores)
+        _write_preview(out, clip, playback, table, log.events, report)
+        return Outcome(out, table, report, report.before + time.perf_counter() - began)
 
 
 def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:
