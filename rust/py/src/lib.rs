@@ -106,7 +106,8 @@ fn camera_model_named(name: &str) -> PyResult<CameraModel> {
 
 /// Runs the engine without the interpreter lock; a panic, which would be a bug, becomes a `RuntimeError`.
 fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + Send) -> PyResult<R> {
-    py.detach(|| catch_unwind(AssertUnwindSafe(work)))
+    // Entered once: from outside, every stage would wake a thread of the pool and sleep until it is done.
+    py.detach(|| catch_unwind(AssertUnwindSafe(|| rayon::scope(|_| work()))))
         .map_err(|_| PyRuntimeError::new_err("the rasteriser failed; please report this as a bug"))?
         .map_err(value_error)
 }
