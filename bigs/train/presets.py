@@ -143,7 +143,7 @@ _OBJECT_DETAIL = OptimizeStage(
         "object.opacity": 0.02,
         "object.orient": 0.0007,
         "object.ray": 0.0002,
-        "scene.light": 2e-3,
+        # Not the clip's light: the hands, which are not seen here, share it.
         "scene.shade": 2e-3,
     },
     weights={
