@@ -143,7 +143,8 @@ _OBJECT_DETAIL = OptimizeStage(
         "object.opacity": 0.02,
         "object.orient": 0.0007,
         "object.ray": 0.0002,
-        # Not the clip's light: the hands, which are not seen here, share it.
+        # Not the clip's light, which the hands share, and no prior on shade below: hands are not seen here,
+        # and nothing would hold against it.
         "scene.shade": 2e-3,
     },
     weights={
@@ -151,7 +152,6 @@ _OBJECT_DETAIL = OptimizeStage(
         "mse": 30.0,
         "coverage": 0.2,
         "scale": 100.0,
-        "shade_prior": 0.02,
         "object_prior": 0.1,
         "object_acceleration": 0.005,
     },
