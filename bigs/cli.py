@@ -387,6 +387,8 @@ def _config(preset: Preset, file: Path | None, changes: tuple[str, ...]) -> RunC
 def _show(outcome: Outcome) -> None:
     for line in outcome.report.skipped:
         _out.print(f"skipped: {line}", markup=False, highlight=False, soft_wrap=True)
+    for line in outcome.report.retreats:
+        _out.print(f"recovered: {line}", markup=False, highlight=False, soft_wrap=True)
     _print_table(outcome.table)
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.report.seconds.items())
     _out.print(f"{outcome.seconds:.0f} s in all: {times}", markup=False, highlight=False, soft_wrap=True)

@@ -331,6 +331,7 @@ def check_plan(config: RunConfig) -> None:
             least[f"{where}.least"] = (stage.least, 2)
             least[f"{where}.slack"] = (stage.slack, 0.0)
             least[f"{where}.bridge"] = (stage.bridge, 0)
+            least[f"{where}.longest_move"] = (stage.longest_move, 0)
             continue
         if isinstance(stage, SplitStage):
             least[f"{where}.parts"] = (stage.parts, 1)

@@ -51,6 +51,19 @@ def test_one_faulty_frame_does_not_end_a_grasp_but_a_new_place_does() -> None:
     assert still_frames(joints_at(jump), everywhere, STAGE) == [range(0, 7), range(8, len(jump))]
 
 
+def test_every_threshold_decides_something() -> None:
+    positions = moved(*[0.001] * 6, 0.03, -0.03, *[0.001] * 6)
+    everywhere = torch.ones(len(positions))
+
+    def found(**changes: float) -> list[range]:
+        return still_frames(joints_at(positions), everywhere, GraspStage(**changes))
+
+    assert found() == [range(0, len(positions))]
+    assert found(bridge=0) == [range(0, 7), range(8, len(positions))]
+    assert found(speed=0.0005) == []
+    assert found(bridge=0, least=8) == []
+
+
 def test_short_stretches_are_no_grasps() -> None:
     positions = moved(*[0.02] * 4, *[0.0] * 2, *[0.02] * 4)
     assert still_frames(joints_at(positions), torch.ones(11), STAGE) == []
@@ -177,7 +190,10 @@ def test_a_robust_mean_ignores_a_minority() -> None:
     assert rotation_angle(mean) < 0.05
 
 
-@pytest.mark.parametrize(("name", "value"), [("speed", -1.0), ("least", 1), ("slack", -0.1), ("bridge", -1)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("speed", -1.0), ("least", 1), ("slack", -0.1), ("bridge", -1), ("longest_move", -1)],
+)
 def test_thresholds_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"stages.grasps.{name}"):
         check_plan(RunConfig(stages=(GraspStage(**{name: value}),)))

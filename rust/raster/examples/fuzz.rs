@@ -13,25 +13,27 @@ mod fuzz;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
+use lexopt::prelude::*;
+
 const USAGE: &str = "usage: fuzz [--seconds S] [--first SEED] | fuzz --seed SEED";
 
 fn main() -> ExitCode {
     let (mut seconds, mut seed, mut only) = (60, 1, None);
-    let mut arguments = std::env::args().skip(1);
-    while let Some(name) = arguments.next() {
-        let Some(value) = arguments.next().and_then(|v| v.parse::<u64>().ok()) else {
-            eprintln!("{USAGE}");
-            return ExitCode::from(2);
-        };
-        match name.as_str() {
-            "--seconds" => seconds = value,
-            "--first" => seed = value,
-            "--seed" => only = Some(value),
-            _ => {
-                eprintln!("{USAGE}");
-                return ExitCode::from(2);
+    let mut parser = lexopt::Parser::from_env();
+    let mut parse = || -> Result<(), lexopt::Error> {
+        while let Some(argument) = parser.next()? {
+            match argument {
+                Long("seconds") => seconds = parser.value()?.parse()?,
+                Long("first") => seed = parser.value()?.parse()?,
+                Long("seed") => only = Some(parser.value()?.parse()?),
+                _ => return Err(argument.unexpected()),
             }
         }
+        Ok(())
+    };
+    if let Err(error) = parse() {
+        eprintln!("{error}\n{USAGE}");
+        return ExitCode::from(2);
     }
     // A panic is caught and reported with its seed; its own message would only repeat that.
     if only.is_none() {
