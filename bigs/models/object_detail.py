@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from bigs.checks import InputError
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.models.object_splats import CanonicalObject
 
@@ -58,8 +59,14 @@ def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> Ob
         whole: the object.
         parts: along each of the two axes; 1 only prunes.
         least_opacity: Gaussians that are less opaque than this are left out.
+
+    Raises:
+        InputError: none is as opaque as that.
     """
     kept = whole.opacities >= least_opacity
+    if not kept.any():
+        most = float(whole.opacities.max())
+        raise InputError(f"least_opacity: expected {most:.3f}, the largest, or less, found {least_opacity}")
     means, quats, scales = whole.means[kept], whole.quats[kept], whole.scales[kept]
     axes = quat_to_matrix(quats)[..., :2] * (scales[:, None, :2] / _SIGMA_PER_SPACING)  # [M, 3, 2]
     steps = (torch.arange(parts) + 0.5) / parts - 0.5

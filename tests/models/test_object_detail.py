@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bigs.checks import InputError
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.object_splats import CanonicalObject
 from bigs.raster import rasterization
@@ -57,6 +58,11 @@ def test_what_cannot_be_seen_is_pruned() -> None:
     opacities[:10] = 0.01
     detail = split_object(whole._replace(opacities=opacities), 2, 0.05)
     assert len(detail().means) == 4 * (len(opacities) - 10)
+
+
+def test_an_object_does_not_vanish() -> None:
+    with pytest.raises(InputError, match=r"least_opacity: expected 0\.950, .*found 0\.99"):
+        split_object(plate(), 2, 0.99)
 
 
 def test_parameters_do_what_they_are_called() -> None:
