@@ -209,7 +209,8 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
         return "the clip has no object" if scene.object_splats is None else None
     if not stage.weights:
         return "no loss term is left"
-    subjects = {group.split(".")[0] for group in stage.lrs}
+    # The clip's light and shade alone are no subject.
+    subjects = {group.split(".")[0] for group in stage.lrs} - {"scene"}
     if subjects == {"hand"} and not scene.sides:
         return "the clip has no hand"
     if subjects == {"object"} and scene.object_splats is None:
