@@ -4,7 +4,10 @@ BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup demo test lint test-rust test-python bench wheel clean
+# What the tests use beside it: every optional part, so that none is skipped.
+ALL_EXTRAS := dev,synthetic,video,bench,diffusion,segment,viewer,export,rerun,slurm,ray,browser
+
+.PHONY: setup setup-all demo test lint test-rust test-python bench wheel clean
 
 setup: $(BIN)/bigs
 
@@ -16,11 +19,16 @@ $(BIN)/bigs: pyproject.toml constraints.txt $(RUST_SOURCES)
 	. $(BIN)/activate && maturin develop --release --extras dev,synthetic,video
 	@touch $(BIN)/bigs
 
+setup-all: .venv/all-extras
+.venv/all-extras: $(BIN)/bigs
+	. $(BIN)/activate && maturin develop --release --extras $(ALL_EXTRAS)
+	@touch .venv/all-extras
+
 demo: setup
 	rm -rf demo_run
 	$(BIN)/bigs demo --out demo_run
 
-test: setup lint test-rust test-python
+test: setup-all lint test-rust test-python
 
 lint:
 	$(BIN)/ruff check .

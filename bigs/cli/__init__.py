@@ -1,0 +1,3 @@
+"""The command line `bigs`."""
+
+from bigs.cli.app import main as main

@@ -1,0 +1,5 @@
+"""`python -m bigs.cli`."""
+
+from bigs.cli.app import main
+
+main()

@@ -1,0 +1,95 @@
+"""The command line: which commands there are, and how their failures are told. Only this package prints."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import re
+import sys
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Union
+
+import tyro
+
+from bigs import __version__
+from bigs.checks import InputError
+from bigs.cli import bench, runs
+from bigs.cli.terminal import fail, say
+
+Commands = Mapping[str, "Callable[..., None] | Commands"]
+
+COMMANDS: Commands = {
+    "demo": runs.demo,
+    "info": runs.info,
+    "reconstruct": runs.reconstruct,
+    "eval": runs.evaluate,
+    "render": runs.render,
+    "export": runs.export,
+    "ablate": runs.ablate,
+    "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},
+}
+# What the help says of commands that have commands of their own.
+GROUPS = {"bench": "Measure how fast and how exact this is."}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; the exit code is 0 only on success."""
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        say(f"bigs {__version__}")
+        return
+    try:
+        _parse(arguments)()
+    except InputError as error:
+        fail(str(error), 2)
+    except FloatingPointError as error:
+        fail(f"{error}; the last checkpoint is kept", 3)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        fail(f"{place}expected a file or folder that can be read or written, found: {error.strerror}", 4)
+    except KeyboardInterrupt:
+        fail("interrupted; --resume continues from the last checkpoint", 130)
+
+
+def _parse(arguments: list[str] | None) -> Callable[[], None]:
+    """The command that the arguments ask for, ready to run; unknown options are refused in one line."""
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                _choice_of(COMMANDS),
+                prog="bigs",
+                description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU. "
+                "The only option without a command is --version.",
+                args=arguments,
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        # The parser draws a box of several lines; its words are kept, its frame is not.
+        words = " ".join(re.sub(r"[╭╮╰╯│─]+", " ", said.getvalue()).split())
+        fail(words, 2)
+        raise
+
+
+def _choice_of(commands: Commands) -> Any:
+    """The type from which the parser makes one of the commands, ready to run."""
+
+    def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+        @functools.wraps(command)
+        def bind(*args: object, **kwargs: object) -> Callable[[], None]:
+            return functools.partial(command, *args, **kwargs)
+
+        return bind
+
+    # A union has at least two members; the one that says nothing is hidden.
+    options: list[Any] = [Annotated[None, tyro.conf.Suppress]]
+    for name, command in commands.items():
+        if callable(command):
+            choice = tyro.conf.subcommand(name=name, constructor=deferred(command))
+        else:
+            inner = functools.partial(_choice_of, command)
+            choice = tyro.conf.subcommand(name=name, description=GROUPS[name], constructor_factory=inner)
+        options.append(Annotated[Any, choice])
+    return Union[tuple(options)]  # noqa: UP007

@@ -1,0 +1,97 @@
+"""The commands `bigs bench ...`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bigs.cli.terminal import Preset, fail_for, print_tables, stderr, use_threads
+
+# The names of `bench.workloads.KINDS`, `bench.plan.PARTS` and `bench.peers.PEERS`; a test compares.
+Workload = Literal["A", "B", "C", "D"]
+Part = Literal["levels", "stages", "memory", "skips", "curve", "peers"]
+Peer = Literal["gsplat"]
+
+
+def bench_engine(
+    out: Path = Path("bench"),
+    workloads: tuple[Workload, ...] = ("A", "B", "C", "D"),
+    parts: tuple[Part, ...] = ("levels", "stages", "memory", "skips", "curve", "peers"),
+    peers: tuple[Peer, ...] = ("gsplat",),
+    threads: tuple[int, ...] = (1, 2),
+    repeats: int = 15,
+    budget: float = 20.0,
+    scale: float = 1.0,
+    seed: int = 0,
+) -> None:
+    """Time the splatting engine and its peers, with errors, and draw the curve of time against error.
+
+    Args:
+        out: folder for engine.md, engine.json and engine.png.
+        workloads: hand and object isotropic (A) and flat (B), dense scene (C), faint pile (D); taken from the
+            folder that BIGS_BENCH names if it is set.
+        parts: what to measure beside plain times.
+        peers: other renderers to time in the same run, where they are installed.
+        threads: numbers of threads.
+        repeats: alternating runs of everything, of which the median counts.
+        budget: seconds after which one variant of a workload is not run again.
+        scale: of the number of Gaussians and of pixels; 0.01 takes seconds.
+        seed: of the workloads.
+    """
+    from bigs.commands.bench import bench_engine as run
+
+    with stderr.status("starting") as status:
+        tables = run(
+            out,
+            workloads,
+            seed=seed,
+            scale=scale,
+            threads=threads,
+            parts=parts,
+            peers=peers,
+            repeats=repeats,
+            budget=budget,
+            listen=status.update,
+        )
+    print_tables(tables, out)
+
+
+def bench_reconstruct(
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("bench"),
+    presets: tuple[Preset, ...] = ("fast",),
+    without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    steps_limit: int = 0,
+    hand_model: Path | None = None,
+    frames: tuple[int, ...] = (15, 30, 60),
+    growth_steps: int = 6,
+    picture: bool = True,
+    threads: int = 0,
+) -> None:
+    """Time presets and switches over clips, with errors and where the time goes.
+
+    Args:
+        clips: clips; one that has its gt.npz is scored.
+        out: folder for the runs, reconstruct.md, .json and .png; finished runs are kept.
+        presets: what to run.
+        without: run the first preset without this, too (a name of reconstruct --without, or several joined
+            by +); repeatable.
+        steps_limit: presets with more steps are cut to about so many, and say so; 0 runs all.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        frames: numbers of frames for which the growth of the cost is measured.
+        growth_steps: steps of each stage for that; 0 measures no growth.
+        picture: draw the picture, which needs matplotlib.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.bench.run_tables import BRIEF
+    from bigs.commands.bench_reconstruct import RunPlan
+    from bigs.commands.bench_reconstruct import bench_reconstruct as run
+
+    plan = RunPlan(clips, presets, without, steps_limit, hand_model, frames, growth_steps)
+    with stderr.status("starting") as status:
+        found = run(plan, out, picture=picture, listen=status.update)
+    print_tables([table for table in found.tables if table.title in BRIEF], out)
+    fail_for(found.failed)

@@ -1,0 +1,202 @@
+"""Commands that make a run and use it: demo, info, reconstruct, eval, render, export, ablate."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from bigs.cli.terminal import (
+    Preset,
+    fail_for,
+    print_table,
+    print_tables,
+    say,
+    settings_of,
+    stderr,
+    use_threads,
+)
+
+if TYPE_CHECKING:
+    from bigs.commands.reconstruct import Outcome
+
+# The names of `commands.run_folder.FORMATS`; a test compares.
+Format = Literal["ply", "poses", "challenge", "mesh", "hand-meshes"]
+
+
+def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0, seed: int = 0) -> None:
+    """Make a little clip of two hands and a bottle, reconstruct it, and show how much better it became.
+
+    Args:
+        out: folder for the clip and the run; must not hold an earlier demo.
+        preset: how much work to put in.
+        threads: CPU threads; 0 takes all.
+        seed: of the clip and of the reconstruction.
+    """
+    use_threads(threads)
+    from bigs.commands.demo import demo as run_demo
+    from bigs.commands.progress import progress_listener
+
+    config = settings_of(preset, None, (f"seed={seed}",))
+    with progress_listener(stderr, config) as listen:
+        outcome = run_demo(out, config, seed=seed, listen=listen)
+    show(outcome)
+
+
+def info(clip: Annotated[Path, tyro.conf.Positional]) -> None:
+    """Check a clip and say what it holds.
+
+    Args:
+        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+    """
+    from bigs.commands.inspect import describe_clip
+
+    for name, text in describe_clip(clip):
+        say(f"{name:10s} {text}")
+
+
+def reconstruct(
+    clip: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    preset: Preset = "full",
+    hand_model: Path | None = None,
+    gt: Path | None = None,
+    resume: bool = False,
+    config: Path | None = None,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    perceptual_weights: tuple[Path, ...] = (),
+    threads: int = 0,
+) -> None:
+    """Reconstruct the hands and the object of a clip into a run folder.
+
+    Args:
+        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+        out: the run folder to make.
+        preset: smoke (seconds), demo, fast (two minutes), full, or paper (the paper's equations and weights).
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        gt: ground truth (gt.npz) to score against; the reconstruction never sees it.
+        resume: continue an interrupted run in the same folder.
+        config: a config.yaml of an earlier run, instead of a preset.
+        set: change one setting, as path=value (raster.eps2d=0.2, stages.hands-fine.steps=50); repeatable.
+        without: leave out one ingredient (share, smooth, contact, lighting, ...) or loss term; repeatable.
+        perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
+            "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.progress import progress_listener
+    from bigs.commands.reconstruct import reconstruct as run
+    from bigs.train.switches import without_all
+
+    settings, unused = without_all(settings_of(preset, config, set), without)
+    if perceptual_weights:
+        files = tuple(str(path.resolve()) for path in perceptual_weights)
+        settings = dataclasses.replace(settings, perceptual_weights=files)
+    with progress_listener(stderr, settings) as listen:
+        outcome = run(
+            clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen
+        )
+    for name in unused:
+        say(f"--without {name}: this plan has nothing of it")
+    show(outcome)
+
+
+def evaluate(run: Annotated[Path, tyro.conf.Positional], gt: Path) -> None:
+    """Score a finished run against ground truth, with the field's own definitions.
+
+    Args:
+        run: the run folder.
+        gt: ground truth file (gt.npz) or the clip folder that holds it.
+    """
+    from bigs.commands.evaluation import evaluate_run
+
+    print_table(evaluate_run(run, gt))
+
+
+def render(run: Annotated[Path, tyro.conf.Positional], cameras: Path, out: Path, threads: int = 0) -> None:
+    """Render a finished run from the cameras of a transforms.json, as RGBA pictures with straight colour.
+
+    Args:
+        run: the run folder.
+        cameras: transforms.json (OpenGL camera-to-world; each frame names its frame_index).
+        out: folder for 0000.png, 0001.png, ... in the file's order.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.rendering import render_cameras
+
+    files = render_cameras(run, cameras, out)
+    say(f"{len(files)} pictures in {out}")
+
+
+def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path | None = None) -> None:
+    """Write a finished run in another program's format.
+
+    Args:
+        run: the run folder.
+        format: ply (Gaussians), poses (npz), challenge (.pt), mesh (object), or hand-meshes (every frame).
+        out: where to write; the run folder if not given.
+    """
+    from bigs.commands.run_folder import load_run, write_format
+
+    files = write_format(run if out is None else out, load_run(run), format)
+    for path in files if len(files) <= 10 else [files[0], "...", files[-1]]:
+        say(str(path))
+
+
+def ablate(
+    clip: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    preset: Preset = "fast",
+    rows: tuple[str, ...] | None = None,
+    hand_model: Path | None = None,
+    gt: Path | None = None,
+    config: Path | None = None,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    threads: int = 0,
+) -> None:
+    """Score the method with and without its ingredients on a clip, beside the paper's Table 3.
+
+    Args:
+        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+        out: folder for one run per row, ablation.md and ablation.json; rows that it holds are not run again.
+        preset: the full method.
+        rows: what to leave out, each a name of reconstruct --without or several joined by +; the paper's if
+            not given.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        gt: ground truth (gt.npz) to score against; the clip's own if not given.
+        config: a config.yaml of an earlier run, instead of a preset.
+        set: change one setting, as path=value; repeatable.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.ablate import ablate as run
+    from bigs.commands.ablate import default_rows
+
+    settings = settings_of(preset, config, set)
+    with stderr.status("starting") as status:
+        found = run(
+            clip,
+            out,
+            settings,
+            default_rows() if rows is None else rows,
+            hand_model=hand_model,
+            ground_truth=gt,
+            listen=status.update,
+        )
+    print_tables([found.table], out)
+    fail_for(found.failed)
+
+
+def show(outcome: Outcome) -> None:
+    for line in outcome.report.skipped:
+        say(f"skipped: {line}")
+    for line in outcome.report.retreats:
+        say(f"recovered: {line}")
+    print_table(outcome.table)
+    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.report.seconds.items())
+    say(f"{outcome.seconds:.0f} s in all: {times}")
+    say(f"results in {outcome.run}: see preview.png and report.html")

@@ -1,0 +1,78 @@
+"""What the commands share: how they speak, which settings they make of their options, threads."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NoReturn
+
+from rich.console import Console
+
+from bigs.checks import InputError
+
+if TYPE_CHECKING:
+    from bigs.bench.page import Table
+    from bigs.train.config import RunConfig
+
+# The names of `train.presets.PRESETS`, spelled out because importing those takes seconds; a test compares.
+Preset = Literal["smoke", "demo", "fast", "full", "paper"]
+
+stdout = Console()
+stderr = Console(stderr=True)
+
+
+def say(text: str) -> None:
+    """A line on standard output, as it is: nothing coloured, nothing wrapped."""
+    stdout.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def fail(message: str, code: int) -> NoReturn:
+    stderr.print(f"bigs: {message}", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(code)
+
+
+def use_threads(threads: int) -> None:
+    """Limit both thread pools; the engine's reads its variable when it is first used."""
+    if threads < 0:
+        raise InputError(f"--threads: expected 0 or more, found {threads}")
+    if threads:
+        os.environ["RAYON_NUM_THREADS"] = str(threads)
+        import torch
+
+        torch.set_num_threads(threads)
+
+
+def settings_of(preset: Preset, file: Path | None, changes: tuple[str, ...]) -> RunConfig:
+    from bigs.train.config_file import load_config, with_changes
+    from bigs.train.presets import PRESETS
+
+    return with_changes(PRESETS[preset] if file is None else load_config(file), changes)
+
+
+def print_tables(tables: list[Table], out: Path) -> None:
+    for table in tables:
+        say(f"\n{table.title}")
+        print_table(table.rows)
+        say(table.note)
+    say(f"results in {out}")
+
+
+def fail_for(runs: list[str]) -> None:
+    """The exit of a series of which some runs came to nothing."""
+    if runs:
+        fail(f"{len(runs)} failed ({', '.join(runs)}); the others are kept, and a rerun tries these again", 5)
+
+
+def print_table(rows: list[tuple[str, ...]]) -> None:
+    from rich.table import Table
+
+    heading, *body = rows
+    table = Table(*heading)
+    for column in table.columns:
+        column.overflow = "fold"
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in body:
+        table.add_row(*row)
+    stdout.print(table)
