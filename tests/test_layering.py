@@ -34,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "data": BELOW | {"geometry"},
     "metrics": BELOW | {"geometry"},
     "export": BELOW | {"geometry"},
+    "preprocess": BELOW | {"geometry", "hand", "data"},
     "viewer": {"types", "checks", "atomic"},
     "models": BELOW | {"geometry", "hand", "fields"},
     "train": BELOW | {"bigs", "geometry", "raster", "hand", "fields", "losses", "data", "metrics", "models"},

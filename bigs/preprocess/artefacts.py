@@ -1,0 +1,351 @@
+"""What the steps of preprocessing leave for each other below `CLIP/processed`, and whether it is up to date.
+
+Every artefact names its format's `version` and a digest of its `inputs`. A step whose artefact carries the
+digest that its inputs have now is skipped; one whose inputs changed is done again. An artefact without a
+digest was supplied by another tool and is kept as it is. All is in the OpenCV camera frame of its time.
+
+    frames/%04d.png, frames.json    RGB images; original names, frames a second, K and how K was found
+    masks/%04d.png, masks.json      label images 0, 50 object, 150 right, 250 left; what looks wrong in them
+    hands.npz                       `HandTrack` of each side, metres
+    object_sfm.npz                  `ObjectSfm`, structure-from-motion units
+    aligned.npz                     `Alignment`, metres
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from bigs.atomic import atomic_write
+from bigs.checks import InputError
+from bigs.data.base import HandTrack
+from bigs.data.fields import array_field, mapping_field, require
+from bigs.types import SIDES, Side
+
+VERSION = 1
+PROCESSED = "processed"
+FRAMES, FRAMES_FILE = "frames", "frames.json"
+MASKS, MASKS_FILE = "masks", "masks.json"
+HANDS_FILE = "hands.npz"
+SFM_FILE = "object_sfm.npz"
+ALIGNED_FILE = "aligned.npz"
+
+State = Literal["missing", "current", "outdated", "supplied"]
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """What `frames.json` says of the images in `frames/`."""
+
+    names: tuple[str, ...]  # T original names: files, or the video's with the number of the frame in it
+    fps: float  # of the frames that were kept
+    width: int
+    height: int
+    K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
+    camera: str  # how K was found, for people
+    focal_known: bool  # K comes from a measurement, not from an assumption that may be refined
+
+
+@dataclass(frozen=True)
+class ObjectSfm:
+    """The object by structure from motion: `x_cam = rotations x + transl`, all in its own arbitrary unit."""
+
+    rotations: np.ndarray  # [T, 3, 3] object to camera
+    transl: np.ndarray  # [T, 3]
+    valid: np.ndarray  # [T] bool: registered; the others are interpolated
+    confidence: np.ndarray  # [T] in [0, 1]; 0 where a pose is not to be trusted at all
+    points: np.ndarray  # [N, 3] trimmed points, before normalisation
+    colors: np.ndarray  # [N, 3] uint8
+    norm_mat: np.ndarray  # [4, 4]: carries `points` to the centred cloud of unit radius, HOLD's pts.cano
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Hands and object in one metric space: `x_cam = object_rotations (scale x) + object_transl`.
+
+    `x` is a point of `ObjectSfm.points`. Of the hands only the translation is corrected.
+    """
+
+    scale: float  # metres per unit of structure from motion
+    object_rotations: np.ndarray  # [T, 3, 3]
+    object_transl: np.ndarray  # [T, 3] metres
+    object_valid: np.ndarray  # [T] bool
+    hand_transl: dict[Side, np.ndarray]  # [T, 3] metres, replaces that of `HandTrack`
+
+
+def content_digest(*parts: Any) -> str:
+    """A digest of what a step reads.
+
+    Args:
+        parts: a path stands for its content (a folder for the names and contents of its files, a missing one
+            for its absence), anything else for itself as JSON.
+    """
+    found = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            _add_path(found, part)
+        else:
+            found.update(b"json" + json.dumps(part, sort_keys=True, default=_plain).encode() + b"\0")
+    return found.hexdigest()
+
+
+def state_of(path: Path, inputs: str) -> State:
+    """Whether the artefact `path` (.json or .npz) has to be made.
+
+    Args:
+        path: the file that carries the stamp.
+        inputs: the `content_digest` of what the step would read now.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if not path.is_file():
+        return "missing"
+    stored = _read_json(path) if path.suffix == ".json" else _read_npz(path, ("version", "inputs"))
+    if not str(stored.get("inputs", "")):
+        return "supplied"
+    current = int(stored.get("version", 0)) == VERSION and str(stored["inputs"]) == inputs
+    return "current" if current else "outdated"
+
+
+def write_frame_set(processed: Path, frames: FrameSet, inputs: str) -> None:
+    """Write `frames.json`; the images must be there already, since this file says that they are whole."""
+    write_json(processed / FRAMES_FILE, asdict(frames) | {"K": frames.K.tolist()}, inputs)
+
+
+def read_frame_set(processed: Path) -> FrameSet:
+    """Read `frames.json`.
+
+    Raises:
+        InputError: missing, damaged, or a field is not as it should be.
+    """
+    file = processed / FRAMES_FILE
+    stored = _read_json(file)
+    names = require(f"{file}: names", stored, "names")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{file}: names: expected a list of frame names, found {str(names)[:40]}")
+    size = {key: _number(file, stored, key) for key in ("width", "height", "fps")}
+    K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
+        raise InputError(f"{file}: K: expected positive focal lengths over (0, 0, 1), found {K.tolist()}")
+    return FrameSet(
+        names=tuple(names),
+        fps=size["fps"],
+        width=int(size["width"]),
+        height=int(size["height"]),
+        K=K,
+        camera=str(stored.get("camera", "supplied")),
+        focal_known=bool(stored.get("focal_known", True)),
+    )
+
+
+def frame_paths(processed: Path, frames: FrameSet) -> list[Path]:
+    """The image files [T] that go with `frames.json`.
+
+    Raises:
+        InputError: one is missing.
+    """
+    return _numbered(processed / FRAMES, len(frames.names))
+
+
+def mask_paths(processed: Path, frames: FrameSet) -> list[Path]:
+    """The label images [T], one for each frame.
+
+    Raises:
+        InputError: one is missing.
+    """
+    return _numbered(processed / MASKS, len(frames.names))
+
+
+def write_hands(path: Path, hands: Mapping[Side, HandTrack], inputs: str) -> None:
+    """Write `hands.npz`: `SIDE.global_orient` [T, 3], `SIDE.hand_pose` [T, 45], `SIDE.betas`, `SIDE.transl`,
+    `SIDE.valid`; the tracks are in the camera frame of their time."""
+    arrays: dict[str, Any] = {}
+    for side, track in hands.items():
+        arrays |= {
+            f"{side}.global_orient": track.global_orient,
+            f"{side}.hand_pose": track.hand_pose.reshape(len(track.valid), 45),
+            f"{side}.betas": track.betas,
+            f"{side}.transl": track.transl,
+            f"{side}.valid": track.valid,
+        }
+    write_npz(path, arrays, inputs)
+
+
+def read_hands(path: Path, frames: int) -> dict[Side, HandTrack]:
+    """Read `hands.npz`.
+
+    Args:
+        path: the file.
+        frames: how many frames the clip has.
+
+    Raises:
+        InputError: missing, damaged, no hand in it, or a field is not as it should be.
+    """
+    stored = _read_npz(path)
+    sides = [side for side in SIDES if f"{side}.global_orient" in stored]
+    if not sides:
+        raise InputError(f"{path}: expected right.global_orient or left.global_orient, found {_some(stored)}")
+    hands: dict[Side, HandTrack] = {}
+    for side in sides:
+        field = _fields_of(path, stored, f"{side}.")
+        hands[side] = HandTrack(
+            global_orient=field("global_orient", (frames, 3)),
+            hand_pose=field("hand_pose", (frames, 45)).reshape(frames, 15, 3),
+            transl=field("transl", (frames, 3)),
+            betas=field("betas", (10,)),
+            valid=field("valid", (frames,)).astype(bool),
+        )
+    return hands
+
+
+def write_object_sfm(path: Path, sfm: ObjectSfm, inputs: str) -> None:
+    """Write `object_sfm.npz`: `R` [T, 3, 3], `t` [T, 3] and the other fields of `ObjectSfm` by name."""
+    arrays = {"R": sfm.rotations, "t": sfm.transl, "valid": sfm.valid, "confidence": sfm.confidence}
+    arrays |= {"points": sfm.points, "colors": sfm.colors, "norm_mat": sfm.norm_mat}
+    write_npz(path, arrays, inputs)
+
+
+def read_object_sfm(path: Path, frames: int) -> ObjectSfm:
+    """Read `object_sfm.npz`; colours are optional in it, grey then.
+
+    Raises:
+        InputError: missing, damaged, or a field is not as it should be.
+    """
+    stored = _read_npz(path)
+    field = _fields_of(path, stored, "")
+    rotations = field("R", (frames, 3, 3))
+    bad = np.flatnonzero(np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-3)
+    if bad.size:
+        raise InputError(f"{path}: R: expected rotation matrices, found another matrix in frame {bad[0]}")
+    points = field("points", ("N", 3))
+    stored_colors = stored.get("colors", np.full(points.shape, 128))
+    return ObjectSfm(
+        rotations=rotations,
+        transl=field("t", (frames, 3)),
+        valid=field("valid", (frames,)).astype(bool),
+        confidence=field("confidence", (frames,)),
+        points=points,
+        colors=array_field(f"{path}: colors", stored_colors, (len(points), 3)).astype(np.uint8),
+        norm_mat=field("norm_mat", (4, 4)),
+    )
+
+
+def write_alignment(path: Path, alignment: Alignment, inputs: str) -> None:
+    """Write `aligned.npz`: `scale`, `object_rotations`, `object_transl`, `object_valid`, `SIDE.transl`."""
+    arrays = {
+        "scale": np.float64(alignment.scale),
+        "object_rotations": alignment.object_rotations,
+        "object_transl": alignment.object_transl,
+        "object_valid": alignment.object_valid,
+    }
+    write_npz(path, arrays | {f"{side}.transl": t for side, t in alignment.hand_transl.items()}, inputs)
+
+
+def read_alignment(path: Path, frames: int) -> Alignment:
+    """Read `aligned.npz`.
+
+    Raises:
+        InputError: missing, damaged, or a field is not as it should be.
+    """
+    stored = _read_npz(path)
+    field = _fields_of(path, stored, "")
+    scale = float(field("scale", ()))
+    if scale <= 0:
+        raise InputError(f"{path}: scale: expected a positive number, found {scale:g}")
+    return Alignment(
+        scale=scale,
+        object_rotations=field("object_rotations", (frames, 3, 3)),
+        object_transl=field("object_transl", (frames, 3)),
+        object_valid=field("object_valid", (frames,)).astype(bool),
+        hand_transl={
+            side: field(f"{side}.transl", (frames, 3)) for side in SIDES if f"{side}.transl" in stored
+        },
+    )
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any], inputs: str) -> None:
+    """Write arrays with their stamp; the file is whole or absent."""
+    with atomic_write(path) as file:
+        np.savez_compressed(file, version=np.int64(VERSION), inputs=np.str_(inputs), **arrays)
+
+
+def write_json(path: Path, fields: Mapping[str, Any], inputs: str) -> None:
+    """Write fields with their stamp as JSON; the file is whole or absent."""
+    text = json.dumps({"version": VERSION, "inputs": inputs, **fields}, indent=1, default=_plain)
+    with atomic_write(path) as file:
+        file.write(text.encode() + b"\n")
+
+
+def _fields_of(path: Path, stored: Mapping[str, Any], prefix: str) -> Any:
+    """A function that takes a named field out of `stored`, checked."""
+
+    def field(name: str, shape: Sequence[int | str]) -> np.ndarray:
+        where = f"{path}: {prefix}{name}"
+        return array_field(where, require(where, stored, prefix + name), shape)
+
+    return field
+
+
+def _add_path(found: Any, path: Path) -> None:
+    if path.is_dir():
+        for file in sorted(p for p in path.rglob("*") if p.is_file() and not p.name.startswith(".")):
+            found.update(b"name" + str(file.relative_to(path)).encode() + b"\0")
+            _add_path(found, file)
+    elif path.is_file():
+        with path.open("rb") as stream:
+            found.update(b"file" + hashlib.file_digest(stream, "sha256").digest())
+    else:
+        found.update(b"absent\0")
+
+
+def _numbered(folder: Path, count: int) -> list[Path]:
+    paths = [folder / f"{t:04d}.png" for t in range(count)]
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise InputError(f"{missing[0]}: expected an image for each of {count} frames, found no such file")
+    return paths
+
+
+def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:
+    value = float(array_field(f"{file}: {key}", require(f"{file}: {key}", stored, key), ()))
+    if value <= 0:
+        raise InputError(f"{file}: {key}: expected a positive number, found {value:g}")
+    return value
+
+
+def _read_json(file: Path) -> Mapping[str, Any]:
+    try:
+        return mapping_field(str(file), json.loads(file.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise InputError(f"{file}: expected what an earlier step writes, found no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: expected JSON, found {error}") from None
+
+
+def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files if keys is None or key in keys}
+    except FileNotFoundError:
+        raise InputError(f"{file}: expected what an earlier step writes, found no such file") from None
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{file}: expected an .npz of plain arrays, found {error or type(error).__name__}"
+        ) from None
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know of, as what it knows."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def _some(fields: Mapping[str, Any]) -> str:
+    return ", ".join(list(fields)[:6]) or "no fields"
