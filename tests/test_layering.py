@@ -31,13 +31,23 @@ MAY_IMPORT: dict[str, set[str]] = {
     "hand": BELOW | {"geometry"},
     "fields": BELOW | {"geometry"},
     "losses": BELOW | {"geometry"},
+    "guidance": BELOW | {"geometry"},
     "data": BELOW | {"geometry"},
     "metrics": BELOW | {"geometry"},
     "export": BELOW | {"geometry"},
     "preprocess": BELOW | {"geometry", "hand", "data"},
     "viewer": {"types", "checks", "atomic"},
     "models": BELOW | {"geometry", "hand", "fields"},
-    "train": BELOW | {"bigs", "geometry", "raster", "hand", "fields", "losses", "data", "metrics", "models"},
+}
+MAY_IMPORT["train"] = {
+    *MAY_IMPORT["models"],
+    "bigs",
+    "raster",
+    "losses",
+    "guidance",
+    "data",
+    "metrics",
+    "models",
 }
 MAY_IMPORT["bench"] = BELOW | {"bigs", "raster", "_raster"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT) - {"_raster"}

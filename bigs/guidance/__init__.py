@@ -1,0 +1,16 @@
+"""What a diffusion model knows about objects, as a gradient on a picture (paper Eq. 7)."""
+
+from bigs.guidance.denoiser import Conditions, Denoiser, EdgeDetector, classifier_free
+from bigs.guidance.schedule import SdsConfig, timestep_range, timestep_weight
+from bigs.guidance.sds import sds_loss
+
+__all__ = [
+    "Conditions",
+    "Denoiser",
+    "EdgeDetector",
+    "SdsConfig",
+    "classifier_free",
+    "sds_loss",
+    "timestep_range",
+    "timestep_weight",
+]
