@@ -26,6 +26,7 @@ COMMANDS: Commands = {
     "eval": runs.evaluate,
     "render": runs.render,
     "export": runs.export,
+    "view": runs.view,
     "ablate": runs.ablate,
     "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},
 }

@@ -1,7 +1,8 @@
-"""Commands that make a run and use it: demo, info, reconstruct, eval, render, export, ablate."""
+"""Commands that make a run and use it: demo, info, reconstruct, eval, render, export, view, ablate."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -145,6 +146,31 @@ def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path
     files = write_format(run if out is None else out, load_run(run), format)
     for path in files if len(files) <= 10 else [files[0], "...", files[-1]]:
         say(str(path))
+
+
+def view(
+    run: Annotated[Path, tyro.conf.Positional],
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    clip: Path | None = None,
+    gt: Path | None = None,
+) -> None:
+    """Show a finished run in the browser: play it, turn it, bend its fingers. Ctrl-C ends.
+
+    Args:
+        run: the run folder.
+        host: address to listen at; the default can be reached from this machine only.
+        port: where to listen; the next free port is taken if it is in use.
+        clip: the clip with the input images, if it is not where the run found it.
+        gt: ground truth (gt.npz) to show beside the result.
+    """
+    from bigs.commands.view import view as serve
+
+    with stderr.status("starting"):
+        viewer = serve(run, host, port, clip=clip, gt=gt)
+    with viewer, contextlib.suppress(KeyboardInterrupt):
+        say(f"{viewer.url} (Ctrl-C ends)")
+        viewer.wait()
 
 
 def ablate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,14 @@ from bigs.models.poses import ObjectFrames
 from bigs.models.scene import Scene, concatenate
 from bigs.types import SIDES, Entity, Gaussians, HandObjectTrajectory, Side
 
-FORMAT = "bigs-scene-1"
+FORMAT = "bigs-scene-2"
+
+# What has a value for each frame.
+_MOVING_HAND = (
+    *("joints", "verts", "bones", "hand_pose", "shade"),
+    *("global_orient_aa", "hand_pose_aa", "transl"),
+)
+_MOVING_OBJECT = ("rotations", "centers", "shade")
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,10 @@ class HandPlayback:
     transl: Tensor  # [T, 3] metres
     betas: Tensor  # [10]
     v_posed: Tensor  # [V, 3] or [T, V, 3]: shape and pose correctives, not skinned
+    # What it takes to pose the mesh anew (see `repose`), of the canonical hand as `bones` are.
+    lbs_weights: Tensor  # [V, 16]
+    rest_joints: Tensor  # [16, 3] in the clip's shape
+    tip_vertex_ids: Tensor  # [5] thumb, index, middle, ring, pinky
 
 
 @dataclass(frozen=True)
@@ -103,6 +114,20 @@ class Playback:
         return concatenate(
             self._posed(entity, index) for entity in (self.entities if entities is None else entities)
         )
+
+    def at(self, frames: Iterable[int]) -> Playback:
+        """Some frames as a playback of their own."""
+        index = torch.as_tensor(list(frames))
+        hands, obj = dict(self.hands), self.object
+        for side, hand in hands.items():
+            moving = {name: getattr(hand, name)[index] for name in _MOVING_HAND}
+            if hand.v_posed.ndim == 3:
+                moving["v_posed"] = hand.v_posed[index]
+            hands[side] = replace(hand, **moving)
+        if obj is not None:
+            obj = replace(obj, **{name: getattr(obj, name)[index] for name in _MOVING_OBJECT})
+        names = tuple(self.frame_names[t] for t in index.tolist())
+        return replace(self, frame_names=names, hands=hands, object=obj)
 
     def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
         subject = self.object if entity == "object" else self.hands[entity]
@@ -172,6 +197,9 @@ def record(
             transl,
             betas.detach().clone(),
             v_posed,
+            model.lbs_weights,
+            model.rest_joints(betas),
+            model.tip_vertex_ids,
         )
     obj = None
     if scene.object_splats is not None:
