@@ -46,15 +46,17 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
     show(outcome)
 
 
-def info(clip: Annotated[Path, tyro.conf.Positional]) -> None:
+def info(clip: Annotated[Path, tyro.conf.Positional], hand_model: Path | None = None) -> None:
     """Check a clip and say what it holds.
 
     Args:
-        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+        clip: a clip of any layout: a HOLD / HANDS-challenge build folder, a sequence of ARCTIC's raw release
+            (ROOT/images/s05/box_grab_01/1), a clip of HO-3D (ROOT/train/SM1).
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
     """
     from bigs.commands.inspect import describe_clip
 
-    for name, text in describe_clip(clip):
+    for name, text in describe_clip(clip, hand_model):
         say(f"{name:10s} {text}")
 
 

@@ -12,10 +12,11 @@ from bigs.atomic import atomic_write
 from bigs.bench.machine import machine_facts
 from bigs.bench.page import Table, page
 from bigs.checks import InputError
+from bigs.commands.clips import open_estimates
 from bigs.commands.run_folder import write_json
 from bigs.commands.series import FinishedRun, PlannedRun, check_folders, find_ground_truth, run_or_reuse
-from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
+from bigs.commands.truth import load_truth
+from bigs.hand import load_hand_models
 from bigs.metrics.report import METRICS
 from bigs.train.config import RunConfig
 from bigs.train.fit import check_plan
@@ -121,19 +122,19 @@ def ablate(
     """
     chosen = parse_rows(rows)
     check_plan(config)
-    load_hold(clip)
     truth = ground_truth or find_ground_truth(clip)
     if truth is None:
         raise InputError(
             f"--gt: expected ground truth to score against, found none given and no {clip}/gt.npz"
         )
-    load_ground_truth(truth)
     planned, unused = {}, {}
     for row in chosen:
         less, unused[row.name] = without_all(config, row.off)
         check_plan(less)
         planned[row.name] = PlannedRun(out / row.name, clip, less, hand_model, truth)
     check_folders(list(planned.values()))
+    hand_models = load_hand_models(hand_model)
+    load_truth(truth, open_estimates(clip, hand_models).frame_names, hand_models)
     out.mkdir(parents=True, exist_ok=True)
     done: dict[str, FinishedRun] = {}
     for row in chosen:

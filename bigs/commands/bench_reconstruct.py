@@ -18,11 +18,11 @@ from bigs.bench.page import Table, page
 from bigs.bench.run_chart import draw_runs
 from bigs.bench.run_tables import introduction, tables_of_runs
 from bigs.checks import InputError, check_choice
+from bigs.commands.clips import open_estimates
 from bigs.commands.growth import measure, probes
 from bigs.commands.run_folder import write_json
 from bigs.commands.series import PlannedRun, check_folders, find_ground_truth, run_or_reuse
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.hand import load_hand_models
 from bigs.train.config import RunConfig
 from bigs.train.config_file import to_plain
@@ -141,8 +141,9 @@ def bench_reconstruct(
     if picture:
         check_drawing("--picture")
     chosen = variants(plan)
-    clips = dict(zip(names, map(load_hold, plan.clips), strict=True))
     hand_models = load_hand_models(plan.hand_model)
+    opened = [open_estimates(path, hand_models) for path in plan.clips]
+    clips = dict(zip(names, opened, strict=True))
     planned = []
     for name, path in zip(names, plan.clips, strict=True):
         truth = find_ground_truth(path)

@@ -14,6 +14,7 @@ import torch
 import bigs
 from bigs.atomic import remove_parts
 from bigs.checks import InputError
+from bigs.commands.clips import open_estimates
 from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
 from bigs.commands.run_folder import (
     CHECKPOINTS,
@@ -28,9 +29,8 @@ from bigs.commands.run_folder import (
 )
 from bigs.commands.run_lock import only_writer
 from bigs.commands.run_log import RunLog
+from bigs.commands.truth import load_truth
 from bigs.data.base import Clip
-from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.image import psnr, ssim
@@ -75,11 +75,12 @@ def reconstruct(
     Everything is checked before the folder is touched, so that bad input leaves nothing half written.
 
     Args:
-        clip_path: a HOLD `build` folder, or the folder that holds it.
+        clip_path: a clip with estimates, of any layout.
         out: the run folder; made if missing. One that holds a run is refused unless `resume` is set.
         config: see `bigs.train.presets`.
         hand_model: folder or file of MANO-format models; None takes the built-in hand.
-        ground_truth: scores the result and the initial estimates; never seen by the optimisation.
+        ground_truth: scores the result and the initial estimates (see `load_truth`); never seen by the
+            optimisation.
         resume: continue an interrupted run.
         listen: told of stages, steps and notes, for progress displays.
 
@@ -88,11 +89,11 @@ def reconstruct(
     """
     began = time.perf_counter()
     check_plan(config)
-    clip = load_hold(clip_path)
     hand_models = load_hand_models(hand_model)
+    clip = open_estimates(clip_path, hand_models)
     files = [Path(path) for path in config.perceptual_weights]
     network = load_perceptual_weights(files) if files else None
-    truth = None if ground_truth is None else load_ground_truth(ground_truth)
+    truth = None if ground_truth is None else load_truth(ground_truth, clip.frame_names, hand_models)
     if (out / CONFIG).exists() and not resume:
         raise InputError(f"{out}: expected a new run folder, found a run (pass --resume to continue it)")
     baseline = initial_trajectory(clip, hand_models)

@@ -48,13 +48,13 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Clip:
-    """A monocular clip with its initial estimates."""
+    """A monocular clip with its initial estimates, or with a dataset's annotation in their place."""
 
     name: str
     folder: Path  # where image/, mask/ and data.npy lie
     frame_names: tuple[str, ...]  # T original names
     image_paths: tuple[Path, ...]
-    mask_paths: tuple[Path, ...]
+    mask_paths: tuple[Path, ...]  # none at all for a dataset's sequence without masks
     width: int
     height: int
     K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
@@ -66,6 +66,7 @@ class Clip:
         np.ndarray
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the masks; every entity has a key
+    annotated: bool = False  # the tracks are a dataset's truth, which no reconstruction may start from
 
     def __len__(self) -> int:
         return len(self.image_paths)

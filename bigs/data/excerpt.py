@@ -42,7 +42,7 @@ def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
         clip,
         frame_names=tuple(clip.frame_names[t] for t in frames),
         image_paths=tuple(clip.image_paths[t] for t in frames),
-        mask_paths=tuple(clip.mask_paths[t] for t in frames),
+        mask_paths=tuple(clip.mask_paths[t] for t in frames) if clip.mask_paths else (),
         cam_from_world=clip.cam_from_world[frames],
         hands=hands,
         object=obj,

@@ -6,7 +6,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,3 +43,15 @@ def require(where: str, values: Mapping[str, Any], key: str) -> Any:
         found = ", ".join(keys[:8]) + (", ..." if len(keys) > 8 else "")
         raise InputError(f"{where}: expected this field, found {f'only {found}' if keys else 'no fields'}")
     return values[key]
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds, or an InputError."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a {path.name}, found no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected a readable text file, found {error}") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON, found {error}") from None

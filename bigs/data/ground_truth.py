@@ -15,7 +15,10 @@ import numpy as np
 import trimesh
 
 from bigs.checks import InputError
+from bigs.data.annotation import Annotation, ObjectTruth
+from bigs.data.base import HandTrack
 from bigs.data.fields import array_field, require
+from bigs.data.meshes import read_mesh
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
 OBJECT_FILE = "gt_object.ply"
@@ -63,6 +66,53 @@ def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
     )
 
 
+def load_annotation(path: str | Path) -> Annotation:
+    """The same file as poses, from which other layouts are written; its world is the camera.
+
+    Args:
+        path: `gt.npz`, or the clip folder that holds it.
+
+    Raises:
+        InputError: as `load_ground_truth`.
+    """
+    path = Path(path)
+    file = path / "gt.npz" if path.is_dir() else path
+    arrays = _read_npz(file)
+    K = _field(file, arrays, "K", (3, 3))
+    width, height = _field(file, arrays, "wh", (2,)).astype(int)
+    hands: dict[Side, HandTrack] = {}
+    frames: int | str = "T"
+    for side in SIDES:
+        if f"{side}_pose" in arrays:
+            poses = _field(file, arrays, f"{side}_pose", (frames, 48)).reshape(-1, 16, 3)
+            frames = len(poses)
+            hands[side] = HandTrack(
+                global_orient=poses[:, 0],
+                hand_pose=poses[:, 1:],
+                transl=_field(file, arrays, f"{side}_trans", (frames, 3)),
+                betas=_field(file, arrays, f"{side}_betas", (10,)),
+                valid=np.ones(frames, dtype=bool),
+            )
+    obj = None
+    if "obj_R" in arrays:
+        rotations, transl, scale = _object_poses(file, arrays, frames)
+        frames = len(rotations)
+        verts, faces = read_mesh(file.parent / OBJECT_FILE)
+        obj = ObjectTruth(scale * verts, faces, rotations, transl, np.ones(frames, dtype=bool))
+    if not isinstance(frames, int):
+        raise InputError(f"{file}: expected right_pose, left_pose or obj_R, found {', '.join(arrays)}")
+    return Annotation(
+        name=file.resolve().parent.name,
+        frame_names=_frame_names(file, frames),
+        width=int(width),
+        height=int(height),
+        K=K,
+        cam_from_world=np.repeat(np.eye(4)[None], frames, axis=0),
+        hands=hands,
+        object=obj,
+    )
+
+
 def write_ground_truth(
     folder: str | Path, *, arrays: Mapping[str, Any], object_mesh: trimesh.Trimesh | None
 ) -> Path:
@@ -87,23 +137,19 @@ def _read_npz(file: Path) -> dict[str, np.ndarray]:
         ) from None
 
 
-def _read_object(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> tuple[np.ndarray, np.ndarray]:
+def _object_poses(
+    file: Path, arrays: Mapping[str, np.ndarray], frames: int | str
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotations [T, 3, 3], translations [T, 3] and the scale."""
     rotations = _field(file, arrays, "obj_R", (frames, 3, 3))
-    transl = _field(file, arrays, "obj_t", (frames, 3))
-    scale = float(_field(file, arrays, "obj_scale", ())) if "obj_scale" in arrays else 1.0
-    mesh_file = file.parent / OBJECT_FILE
-    if not mesh_file.is_file():
-        raise InputError(f"{mesh_file}: expected the true object beside {file.name}, found no such file")
-    try:
-        mesh = trimesh.load_mesh(mesh_file, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(
-            f"{mesh_file}: expected a triangle mesh, found {error or type(error).__name__}"
-        ) from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{mesh_file}: expected a triangle mesh, found one without faces")
-    verts = np.einsum("tij,nj->tni", rotations, scale * np.asarray(mesh.vertices)) + transl[:, None]
-    return verts, np.asarray(mesh.faces)
+    transl = _field(file, arrays, "obj_t", (len(rotations), 3))
+    return rotations, transl, float(_field(file, arrays, "obj_scale", ())) if "obj_scale" in arrays else 1.0
+
+
+def _read_object(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> tuple[np.ndarray, np.ndarray]:
+    rotations, transl, scale = _object_poses(file, arrays, frames)
+    own, faces = read_mesh(file.parent / OBJECT_FILE)
+    return np.einsum("tij,nj->tni", rotations, scale * own) + transl[:, None], faces
 
 
 def _read_faces(file: Path, arrays: Mapping[str, np.ndarray], key: str, vertex_count: int) -> np.ndarray:

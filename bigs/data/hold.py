@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,17 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.fields import array_field, mapping_field, require
-from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, list_frames, read_image, read_mask
+from bigs.data.images import (
+    IMAGE_SUFFIXES,
+    MASK_SUFFIXES,
+    check_pairs,
+    decode_frames,
+    list_frames,
+    read_image,
+)
 from bigs.data.projection import CAMERA_TOLERANCE, decompose_projection
 from bigs.data.tracks import fill_rotations, fill_vectors
-from bigs.types import ENTITIES, MASK_VALUES, SIDES, Entity, Side
+from bigs.types import ENTITIES, SIDES, Side
 from bigs.unpickle import load_npy
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
@@ -31,6 +37,7 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 # HOLD's defaults; together they make the scaled space's unit half the camera's distance from the origin.
 SCENE_BOUNDING_SPHERE = 6.0
 MAX_RADIUS_RATIO = 3.0
+RADIUS_PER_SHIFT = MAX_RADIUS_RATIO / SCENE_BOUNDING_SPHERE
 
 
 def load_hold(path: str | Path) -> Clip:
@@ -52,7 +59,7 @@ def load_hold(path: str | Path) -> Clip:
     image_paths = list_frames(folder / "image", IMAGE_SUFFIXES)
     mask_paths = list_frames(folder / "mask", MASK_SUFFIXES)
     frame_names = _frame_names(folder / "corres.txt", image_paths)
-    _check_pairs(image_paths, mask_paths)
+    check_pairs(image_paths, mask_paths)
 
     data = mapping_field(str(file), load_npy(file))
     frames = len(image_paths)
@@ -84,7 +91,7 @@ def load_hold(path: str | Path) -> Clip:
         object=obj,
         scene_scale=scene_scale,
         normalize_shift=normalize_shift,
-        mask_areas=_decode_frames(image_paths, mask_paths, (width, height)),
+        mask_areas=decode_frames(image_paths, mask_paths, (width, height)),
     )
 
 
@@ -128,7 +135,7 @@ def write_hold(
     shift = np.asarray(normalize_shift, dtype=np.float64)
     world_mat = np.eye(4)
     world_mat[:3] = K @ np.hstack([GL_FROM_CV, -GL_FROM_CV @ shift[:, None]])
-    radius = np.linalg.norm(shift) * MAX_RADIUS_RATIO / SCENE_BOUNDING_SPHERE
+    radius = np.linalg.norm(shift) * RADIUS_PER_SHIFT
     scale_mat = np.diag([radius, radius, radius, 1.0]).astype(np.float32)
     entities: dict[str, dict[str, Any]] = {side: _hand_entity(track) for side, track in hands.items()}
     if object is not None:
@@ -147,6 +154,11 @@ def write_hold(
     }
     np.save(build / "data.npy", np.array(data, dtype=np.object_))
     return build
+
+
+def shift_before(center_cam: np.ndarray) -> np.ndarray:
+    """The `normalize_shift` [3] that puts a point of the camera's frame one metre before HOLD's camera."""
+    return -GL_FROM_CV @ center_cam + np.array([0.0, 0.0, -1.0])
 
 
 def _build_folder(path: Path) -> Path:
@@ -173,32 +185,6 @@ def _frame_names(file: Path, image_paths: Sequence[Path]) -> tuple[str, ...]:
             f"{file}: expected one line for each of {len(image_paths)} images, found {len(names)}"
         )
     return names
-
-
-def _check_pairs(image_paths: Sequence[Path], mask_paths: Sequence[Path]) -> None:
-    mask_folder = mask_paths[0].parent
-    if len(image_paths) != len(mask_paths):
-        raise InputError(
-            f"{mask_folder}: expected a mask for each of {len(image_paths)} images, found {len(mask_paths)}"
-        )
-    for image, mask in zip(image_paths, mask_paths, strict=True):
-        if image.stem != mask.stem:
-            raise InputError(f"{mask_folder}: expected a mask named {image.stem}, found {mask.name}")
-
-
-def _decode_frames(
-    image_paths: Sequence[Path], mask_paths: Sequence[Path], size: tuple[int, int]
-) -> dict[Entity, np.ndarray]:
-    """Decode everything once, as a check, and count each entity's mask pixels: {entity: [T]}."""
-
-    def areas(pair: tuple[Path, Path]) -> list[int]:
-        read_image(pair[0], size)
-        counts = np.bincount(read_mask(pair[1], size).ravel(), minlength=256)
-        return [int(counts[MASK_VALUES[entity]]) for entity in ENTITIES]
-
-    with ThreadPoolExecutor() as pool:
-        table = np.array(list(pool.map(areas, zip(image_paths, mask_paths, strict=True))))
-    return {entity: table[:, column] for column, entity in enumerate(ENTITIES)}
 
 
 def _read_cameras(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.types import MASK_VALUES
+from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MASK_SUFFIXES = (".png",)
@@ -69,6 +70,40 @@ def read_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
             f"{path}: expected the mask values {expected}, found {', '.join(map(str, other[:4]))}"
         )
     return pixels
+
+
+def check_pairs(image_paths: Sequence[Path], mask_paths: Sequence[Path]) -> None:
+    """Raise `InputError` unless there is a mask of the same name for each image."""
+    mask_folder = mask_paths[0].parent
+    if len(image_paths) != len(mask_paths):
+        raise InputError(
+            f"{mask_folder}: expected a mask for each of {len(image_paths)} images, found {len(mask_paths)}"
+        )
+    for image, mask in zip(image_paths, mask_paths, strict=True):
+        if image.stem != mask.stem:
+            raise InputError(f"{mask_folder}: expected a mask named {image.stem}, found {mask.name}")
+
+
+def decode_frames(
+    image_paths: Sequence[Path], mask_paths: Sequence[Path], size: tuple[int, int]
+) -> dict[Entity, np.ndarray]:
+    """Decode everything once, as a check, and count each entity's mask pixels: {entity: [T]}.
+
+    Without masks every count is 0.
+    """
+
+    def check(image: Path) -> None:
+        read_image(image, size)
+
+    def areas(mask: Path) -> list[int]:
+        counts = np.bincount(read_mask(mask, size).ravel(), minlength=256)
+        return [int(counts[MASK_VALUES[entity]]) for entity in ENTITIES]
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(check, image_paths))
+        counts = list(pool.map(areas, mask_paths)) or [[0] * len(ENTITIES)] * len(image_paths)
+    table = np.array(counts)
+    return {entity: table[:, column] for column, entity in enumerate(ENTITIES)}
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, str]:

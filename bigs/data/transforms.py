@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import array_field, mapping_field, read_json, require
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -46,7 +46,7 @@ def load_transforms(path: str | Path, *, frame_count: int | None = None) -> list
         InputError: not JSON, a missing field, distortion, a matrix that is not rigid, a frame out of range.
     """
     path = Path(path)
-    document = mapping_field(str(path), _read_json(path))
+    document = mapping_field(str(path), read_json(path))
     frames = require(f"{path}: frames", document, "frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames: expected a list of cameras, found {_brief(frames)}")
@@ -85,17 +85,6 @@ def write_transforms(path: str | Path, cameras: Sequence[RenderCamera]) -> None:
         for index, camera in enumerate(cameras)
     ]
     Path(path).write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1) + "\n")
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a transforms.json, found no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a readable text file, found {error}") from None
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
 
 
 def _check_lens(where: str, values: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError, check_choice
 from bigs.data.base import HandTrack, ObjectTrack
 from bigs.data.ground_truth import write_ground_truth
-from bigs.data.hold import GL_FROM_CV, write_hold
+from bigs.data.hold import GL_FROM_CV, shift_before, write_hold
 from bigs.data.synthetic.estimates import HandGuess, ObjectGuess, guess_hand, guess_object
 from bigs.data.synthetic.grasp import FINGERS, Grasp, HandLike, find_grasp, pose_hand, rest_joints
 from bigs.data.synthetic.motion import HandMotion, carry_hand, frame_camera, turn_object
@@ -276,7 +276,7 @@ def _object_track(guess: ObjectGuess, colors: np.ndarray) -> tuple[ObjectTrack, 
     in_camera = (
         np.einsum("tij,j->ti", guess.rotations, guess.scale * np.median(guess.points, axis=0)) + guess.transl
     )
-    shift = -GL_FROM_CV @ np.median(in_camera, axis=0) + np.array([0.0, 0.0, -1.0])
+    shift = shift_before(np.median(in_camera, axis=0))
     metric_from_canon = np.diag([guess.scale * radius] * 3 + [1.0])
     metric_from_canon[:3, 3] = guess.scale * center
     track = ObjectTrack(

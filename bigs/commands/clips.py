@@ -1,0 +1,36 @@
+"""Clips as commands take them: of any layout, and with estimates where a reconstruction starts from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from bigs.checks import InputError
+from bigs.data.base import Clip
+from bigs.data.layouts import load_clip
+from bigs.hand import HandModel
+from bigs.types import Side
+
+
+def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
+    """A clip of any layout that `bigs.data.layouts` knows.
+
+    Raises:
+        InputError: the clip is not as it should be.
+    """
+    return load_clip(path, hand_models["right"].hands_mean.double().numpy())
+
+
+def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
+    """A clip from which a reconstruction can start: with masks, and with estimates that are not the truth.
+
+    Raises:
+        InputError: the clip is not as it should be, or holds a data set's annotation.
+    """
+    clip = open_clip(path, hand_models)
+    if clip.annotated:
+        raise InputError(
+            f"{path}: expected a clip with initial estimates, found a data set's ground truth, which scores "
+            "runs (--gt); bigs preprocess estimates from its images, bigs convert starts from the truth"
+        )
+    return clip

@@ -1,0 +1,83 @@
+"""The truth of a run's frames, from whatever file or data set holds it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from bigs.checks import InputError
+from bigs.data.annotation import Annotation
+from bigs.data.arctic import find_arctic, read_arctic
+from bigs.data.ground_truth import load_ground_truth
+from bigs.data.ho3d import find_ho3d, read_ho3d
+from bigs.hand import HandModel
+from bigs.types import HandObjectTrajectory, Side
+
+
+def load_truth(
+    path: Path, frame_names: Sequence[str], hand_models: Mapping[Side, HandModel]
+) -> HandObjectTrajectory:
+    """The true joints and meshes of a clip.
+
+    Args:
+        path: `gt.npz` or the folder that holds it, a sequence of ARCTIC's raw release, or a clip of HO-3D.
+        frame_names: the frames wanted from a data set, by their own names; `gt.npz` gives those that it has.
+        hand_models: those that the data set's poses were fitted with; `gt.npz` needs none.
+
+    Returns:
+        The trajectory; NaN in frames that the data set does not annotate.
+
+    Raises:
+        InputError: no truth there, or it is not as it should be.
+    """
+    if path.suffix == ".npz" or (path / "gt.npz").is_file():
+        return load_ground_truth(path)
+    clip = find_ho3d(path) if path.is_dir() else None
+    if clip is not None:
+        mean = hand_models["right"].hands_mean.double().numpy()
+        return pose_annotation(read_ho3d(clip, frame_names, mean), hand_models)
+    sequence = find_arctic(path)
+    if sequence is not None:
+        return pose_annotation(read_arctic(sequence, frame_names), hand_models)
+    raise InputError(
+        f"{path}: expected gt.npz, a folder that holds it, an ARCTIC raw sequence or an HO-3D clip, found "
+        f"{'another folder' if path.is_dir() else 'nothing'}"
+    )
+
+
+@torch.no_grad()
+def pose_annotation(annotation: Annotation, hand_models: Mapping[Side, HandModel]) -> HandObjectTrajectory:
+    """An annotation as joints and meshes in the camera's frame, in double precision."""
+    to_cam = annotation.cam_from_world
+    joints: dict[Side, np.ndarray] = {}
+    verts: dict[Side, np.ndarray] = {}
+    for side, track in annotation.hands.items():
+        model = copy.deepcopy(hand_models[side]).double()
+        betas = torch.from_numpy(track.betas)
+        wrist = model.rest_joints(betas)[0].numpy() + track.transl
+        orient = to_cam[:, :3, :3] @ Rotation.from_rotvec(track.global_orient).as_matrix()
+        wrist_cam = np.einsum("tij,tj->ti", to_cam[:, :3, :3], wrist) + to_cam[:, :3, 3]
+        fingers = model.pose_matrices(torch.from_numpy(track.hand_pose))
+        out = model(betas, fingers, torch.from_numpy(orient), torch.from_numpy(wrist_cam))
+        unknown = ~track.valid[:, None, None]
+        joints[side] = np.where(unknown, np.nan, out.joints.numpy())
+        verts[side] = np.where(unknown, np.nan, out.vertices.numpy())
+    object_verts = None
+    if annotation.object is not None:
+        world = annotation.object.verts_world()
+        object_verts = np.einsum("tij,tnj->tni", to_cam[:, :3, :3], world) + to_cam[:, None, :3, 3]
+        object_verts[~annotation.object.valid] = np.nan
+    return HandObjectTrajectory(
+        name=annotation.name,
+        frame_names=annotation.frame_names,
+        joints=joints,
+        verts=verts,
+        faces={side: hand_models[side].faces.numpy() for side in joints},
+        object_verts=object_verts,
+        object_faces=None if annotation.object is None else annotation.object.faces,
+    )

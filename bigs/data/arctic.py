@@ -1,0 +1,271 @@
+"""ARCTIC's raw release: raw_seqs/, meta/, images/; poses of both hands and of an articulated object.
+
+World axes are the motion capture's, metres. Annotation row of an image: its number minus the subject's
+`ioi_offset`. A sequence seen by one camera is named ROOT/images/SUBJECT/SEQUENCE/VIEW, and ROOT is the folder
+that holds raw_seqs/ and meta/. Views 1 to 8 stand still; view 0 is the egocentric camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bigs.checks import InputError
+from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
+from bigs.data.base import Clip, HandTrack
+from bigs.data.fields import array_field, mapping_field, read_json, require
+from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames
+from bigs.data.meshes import read_mesh
+from bigs.types import SIDES
+from bigs.unpickle import load_npy
+
+# The paper's camera.
+DEFAULT_VIEW = 1
+MM_PER_M = 1000.0
+# What two hands hold is longer than 2 mm and shorter than 2 m: the template's unit can be told.
+_LONGEST_M = 2.0
+_IMAGE_FOLDERS = ("images", "cropped_images")
+# Ours: label masks may lie here, in the same tree as the images.
+_MASK_FOLDER = "masks"
+
+
+class ArcticView(NamedTuple):
+    """A sequence of the release as one camera sees it."""
+
+    root: Path
+    subject: str  # such as s05
+    sequence: str  # such as box_grab_01
+    view: int
+
+    @property
+    def name(self) -> str:
+        """As HOLD and the HANDS challenge name such a clip."""
+        return f"arctic_{self.subject}_{self.sequence}_{self.view}"
+
+    @property
+    def object_name(self) -> str:
+        return self.sequence.split("_")[0]
+
+    def raw(self, kind: str) -> Path:
+        return self.root / "raw_seqs" / self.subject / f"{self.sequence}.{kind}.npy"
+
+    def frames_in(self, tree: str) -> Path:
+        return self.root / tree / self.subject / self.sequence / str(self.view)
+
+
+def find_arctic(path: str | Path) -> ArcticView | None:
+    """The view that a path names, or None where no folder on the way up is ARCTIC's.
+
+    Args:
+        path: ROOT, ROOT/SUBJECT/SEQUENCE or ROOT/SUBJECT/SEQUENCE/VIEW, with images/, cropped_images/ or
+            raw_seqs/ after ROOT or without; it need not exist below ROOT. The view is 1 if not given.
+
+    Raises:
+        InputError: the release has no such sequence, or several and the path names none.
+    """
+    path = Path(path)
+    absolute = path.absolute()
+    root = next(
+        (p for p in (absolute, *absolute.parents) if (p / "raw_seqs").is_dir() and (p / "meta").is_dir()),
+        None,
+    )
+    if root is None:
+        return None
+    parts = [*absolute.relative_to(root).parts]
+    if parts and parts[0] in (*_IMAGE_FOLDERS, "raw_seqs"):
+        parts = parts[1:]
+    known = sorted(
+        (file.parent.name, file.name.removesuffix(".mano.npy")) for file in root.glob("raw_seqs/*/*.mano.npy")
+    )
+    wanted = (*parts[:1], *(part.split(".")[0] for part in parts[1:2]))
+    matches = [pair for pair in known if pair[: len(wanted)] == wanted]
+    if len(matches) != 1:
+        examples = ", ".join("/".join(pair) for pair in (matches or known)[:4]) or "none"
+        raise InputError(f"{path}: expected ROOT/SUBJECT/SEQUENCE/VIEW of ARCTIC, found sequences {examples}")
+    view = parts[2] if len(parts) > 2 else str(DEFAULT_VIEW)
+    if len(parts) > 3 or view not in "012345678":
+        raise InputError(f"{path}: expected a view from 0 to 8 at the end, found {'/'.join(parts[2:])}")
+    return ArcticView(root, *matches[0], int(view))
+
+
+def load_arctic(path: str | Path) -> Clip:
+    """A view's images with its annotation as tracks (`annotated` is set), and its masks where there are any.
+
+    Raises:
+        InputError: one sentence naming file, field, expected and found.
+    """
+    view = find_arctic(path)
+    if view is None:
+        raise InputError(f"{path}: expected a folder with raw_seqs/ and meta/ of ARCTIC, found none")
+    folder = view.frames_in("images")
+    if not folder.is_dir() and view.frames_in("cropped_images").is_dir():
+        raise InputError(
+            f"{folder}: expected the whole images, found only cropped_images, in which every frame has "
+            "another camera"
+        )
+    image_paths = list_frames(folder, IMAGE_SUFFIXES)
+    mask_paths: tuple[Path, ...] = ()
+    if view.frames_in(_MASK_FOLDER).is_dir():
+        mask_paths = list_frames(view.frames_in(_MASK_FOLDER), MASK_SUFFIXES)
+        check_pairs(image_paths, mask_paths)
+    return annotated_clip(
+        read_arctic(view, [file.name for file in image_paths]), folder, image_paths, mask_paths
+    )
+
+
+def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
+    """The annotation of some images; frames that the release does not annotate are not valid.
+
+    Args:
+        view: see `find_arctic`.
+        frame_names: the images' names, whose stems are numbers.
+
+    Raises:
+        InputError: a missing or damaged file or field, a name that is no number, no annotated frame, or a
+            distorted camera.
+    """
+    meta_file = view.root / "meta" / "misc.json"
+    meta = _subject_meta(meta_file, view.subject)
+    where = f"{meta_file}: {view.subject}"
+    offset = array_field(f"{where}.ioi_offset", require(f"{where}.ioi_offset", meta, "ioi_offset"), ())
+    sizes = array_field(f"{where}.image_size", require(f"{where}.image_size", meta, "image_size"), (9, 2))
+    hands_file = view.raw("mano")
+    stored = mapping_field(str(hands_file), load_npy(hands_file))
+    where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
+    n_rows = len(np.asarray(require(f"{where_hands['right']}.rot", stored.get("right", {}), "rot")))
+    rows = np.array([_frame_number(view, name) for name in frame_names]) - int(offset)
+    valid = (rows >= 0) & (rows < n_rows)
+    if not valid.any():
+        raise InputError(
+            f"{hands_file}: expected the images {frame_names[0]} to {frame_names[-1]} among its {n_rows} "
+            f"frames from {int(offset)} on, found none"
+        )
+    rows = np.clip(rows, 0, n_rows - 1)
+    K, cam_from_world = _camera(view, where, meta, rows)
+    width, height = (int(value) for value in sizes[view.view])
+    return Annotation(
+        name=view.name,
+        frame_names=tuple(frame_names),
+        width=width,
+        height=height,
+        K=K,
+        cam_from_world=cam_from_world,
+        hands={
+            side: _read_hand(where_hands[side], require(where_hands[side], stored, side), n_rows, rows, valid)
+            for side in SIDES
+        },
+        object=_read_object(view, n_rows, rows, valid),
+    )
+
+
+def _subject_meta(file: Path, subject: str) -> Mapping[str, Any]:
+    meta = mapping_field(str(file), read_json(file))
+    return mapping_field(f"{file}: {subject}", require(f"{file}: {subject}", meta, subject))
+
+
+def _frame_number(view: ArcticView, name: str) -> int:
+    stem = Path(name).stem
+    if not stem.isdecimal():
+        raise InputError(f"{view.name}: expected frames named by number as ARCTIC's are, found {name!r}")
+    return int(stem)
+
+
+def _camera(
+    view: ArcticView, where: str, meta: Mapping[str, Any], rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """K [3, 3] and cam_from_world [T, 4, 4] of the view."""
+    if view.view == 0:
+        return _egocentric_camera(view.raw("egocam.dist"), rows)
+    intrinsics = array_field(
+        f"{where}.intris_mat", require(f"{where}.intris_mat", meta, "intris_mat"), (8, 3, 3)
+    )
+    world2cam = array_field(f"{where}.world2cam", require(f"{where}.world2cam", meta, "world2cam"), (8, 4, 4))
+    return intrinsics[view.view - 1], np.repeat(world2cam[view.view - 1][None], len(rows), axis=0)
+
+
+def _egocentric_camera(file: Path, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    stored = mapping_field(str(file), load_npy(file))
+
+    def field(key: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        return array_field(f"{file}: {key}", require(f"{file}: {key}", stored, key), shape)
+
+    if "dist8" in stored and field("dist8", (8,)).any():
+        raise InputError(
+            f"{file}: dist8: expected a camera without distortion, found one that has it; "
+            "use a view from 1 to 8"
+        )
+    cam_from_world = np.repeat(np.eye(4)[None], len(rows), axis=0)
+    cam_from_world[:, :3, :3] = field("R_k_cam_np", ("T", 3, 3))[rows]
+    cam_from_world[:, :3, 3:] = field("T_k_cam_np", ("T", 3, 1))[rows]
+    return field("intrinsics", (3, 3)), cam_from_world
+
+
+def _read_hand(where: str, stored: Any, n_rows: int, rows: np.ndarray, valid: np.ndarray) -> HandTrack:
+    stored = mapping_field(where, stored)
+
+    def field(key: str, shape: tuple[int, ...]) -> np.ndarray:
+        return array_field(f"{where}.{key}", require(f"{where}.{key}", stored, key), shape)
+
+    # One shape for all; the documentation shows it repeated in every frame.
+    is_repeated = np.ndim(require(f"{where}.shape", stored, "shape")) == 2
+    betas = field("shape", (n_rows, 10))[0] if is_repeated else field("shape", (10,))
+    return HandTrack(
+        global_orient=field("rot", (n_rows, 3))[rows],
+        hand_pose=field("pose", (n_rows, 45))[rows].reshape(len(rows), 15, 3),
+        transl=field("trans", (n_rows, 3))[rows],
+        betas=betas,
+        valid=valid,
+    )
+
+
+def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndarray) -> ObjectTruth | None:
+    """The template, bent and moved; None where the release's templates were not downloaded."""
+    folder = view.root / "meta" / "object_vtemplates" / view.object_name
+    if not folder.is_dir():
+        return None
+    verts, faces = read_mesh(folder / "mesh.obj")
+    if np.ptp(verts, axis=0).max() > _LONGEST_M:
+        verts = verts / MM_PER_M
+    file = view.raw("object")
+    poses = array_field(str(file), load_npy(file), (n_rows, 7))[rows]
+    angles = poses[:, 0]
+    if angles.any():
+        is_top = _top_vertices(folder, len(verts))
+        # The lid turns about the template's -z, before the whole moves.
+        turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 0.0, -1.0])).as_matrix()
+        bent = np.repeat(verts[None], len(rows), axis=0)
+        bent[:, is_top] = np.einsum("tij,nj->tni", turns, verts[is_top])
+        verts = bent
+    return ObjectTruth(
+        verts=verts,
+        faces=faces,
+        rotations=Rotation.from_rotvec(poses[:, 1:4]).as_matrix(),
+        transl=poses[:, 4:] / MM_PER_M,
+        valid=valid,
+    )
+
+
+def _top_vertices(folder: Path, n_verts: int) -> np.ndarray:
+    """Which vertices [V] turn with the articulation, bool.
+
+    The documentation calls part 1 the top, the code that scores calls part 0 so. The boxes of both parts
+    decide where they are given, else the code.
+    """
+    parts_file, boxes_file = folder / "parts.json", folder / "object_params.json"
+    parts = array_field(str(parts_file), np.asarray(read_json(parts_file)), (n_verts,))
+    top = 0
+    if boxes_file.is_file() and len(np.unique(parts)) == 2:
+        boxes = mapping_field(str(boxes_file), read_json(boxes_file))
+        corners = {
+            part: array_field(f"{boxes_file}: bbox_{part}", np.asarray(boxes.get(f"bbox_{part}", [])), (8, 3))
+            for part in ("top", "bottom")
+        }
+        verts, _ = read_mesh(folder / "mesh.obj")
+        middle = verts[parts == 0].mean(axis=0)
+        distance = {part: np.linalg.norm(middle - box.mean(axis=0)) for part, box in corners.items()}
+        top = 0 if distance["top"] < distance["bottom"] else 1
+    return parts == top
