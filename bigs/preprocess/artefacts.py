@@ -51,6 +51,9 @@ class FrameSet:
     K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
     camera: str  # how K was found, for people
     focal_known: bool  # K comes from a measurement, not from an assumption that may be refined
+    source_frames: tuple[int, ...] = ()  # T places among the source's frames; () for one after the other
+    source_length: int = 0  # how many frames the source has; 0 for T
+    source_size: tuple[int, int] = (0, 0)  # width, height before shrinking; (0, 0) for those of the frames
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ def read_frame_set(processed: Path) -> FrameSet:
     K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise InputError(f"{file}: K: expected positive focal lengths over (0, 0, 1), found {K.tolist()}")
+    source_width, source_height = stored.get("source_size", (0, 0))
     return FrameSet(
         names=tuple(names),
         fps=size["fps"],
@@ -143,6 +147,9 @@ def read_frame_set(processed: Path) -> FrameSet:
         K=K,
         camera=str(stored.get("camera", "supplied")),
         focal_known=bool(stored.get("focal_known", True)),
+        source_frames=tuple(int(frame) for frame in stored.get("source_frames", ())),
+        source_length=int(stored.get("source_length", 0)),
+        source_size=(int(source_width), int(source_height)),
     )
 
 
