@@ -18,13 +18,14 @@ ROOT = Path(bigs.__file__).parent
 
 # A part is a top-level module or package of bigs; "bigs" itself is its version. Each may import itself and
 # what its entry names. Siblings are apart; what they share lies below them.
-BELOW = {"types", "checks", "atomic", "unpickle"}
+BELOW = {"types", "checks", "atomic", "unpickle", "weights"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bigs": set(),
     "types": set(),
     "checks": set(),
     "atomic": set(),
     "unpickle": {"checks"},
+    "weights": {"checks"},
     "_raster": {"raster"},  # the compiled module's stub names the settings class
     "geometry": BELOW,
     "raster": BELOW | {"geometry", "_raster"},

@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
-from bigs.checks import InputError, check_finite, check_shape
+from bigs.checks import InputError
 from bigs.losses.perceptual import BLOCK_ENDS, VggWeights
+from bigs.weights import checked_weight, load_weights
 
 # Where torchvision's `features` has its convolutions.
 _LAYERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 # torchvision's whole network, its features alone, and the slices into which the lpips package cuts them.
 _CONVOLUTION = re.compile(r"^(?:(?:.*\.)?(?:features|slice[1-5])\.)?(\d+)\.(weight|bias)$")
 _CHANNELS = re.compile(r"^lin(\d)\.model\.1\.weight$")
-# What torch raises for files that are no checkpoint, are cut short, or hold more than plain data.
-_UNREADABLE = (
-    SafetensorError,
-    pickle.UnpicklingError,
-    RuntimeError,
-    OSError,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-)
 
 
 def load_perceptual_weights(paths: Sequence[Path]) -> VggWeights:
@@ -46,7 +31,7 @@ def load_perceptual_weights(paths: Sequence[Path]) -> VggWeights:
     """
     found: dict[str, tuple[Tensor, Path]] = {}
     for path in paths:
-        for key, value in _read(path).items():
+        for key, value in load_weights(path, "VGG-16").items():
             convolution, channels = _CONVOLUTION.match(key), _CHANNELS.match(key)
             if convolution:
                 found[f"features.{convolution[1]}.{convolution[2]}"] = value, path
@@ -71,34 +56,10 @@ def load_perceptual_weights(paths: Sequence[Path]) -> VggWeights:
     return VggWeights(tuple(convolutions), tuple(channel_weights))
 
 
-def _read(path: Path) -> dict[str, Tensor]:
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise InputError(f"{path}: expected a file with VGG-16, found none ({error.strerror})") from error
-    except _UNREADABLE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            f"{path}: expected tensors by name (.safetensors or .pth), found another file ({reason})"
-        ) from error
-    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
-        content = content["state_dict"]
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected tensors by name, found {type(content).__name__}")
-    return {
-        key: value for key, value in content.items() if isinstance(key, str) and isinstance(value, Tensor)
-    }
-
-
 def _take(
     found: dict[str, tuple[Tensor, Path]], name: str, shape: tuple[int | None, ...], where: str
 ) -> Tensor:
     if name not in found:
         raise InputError(f"{where}: expected VGG-16 as torchvision names it, found no {name}")
     value, path = found[name]
-    check_shape(f"{path}: {name}", value, shape)
-    value = value.float().contiguous()  # whatever the precision it is stored in
-    check_finite(f"{path}: {name}", value)
-    return value
+    return checked_weight(f"{path}: {name}", value, shape)

@@ -1,0 +1,171 @@
+"""PiDiNet, a small edge detector, from the files that its authors publish.
+
+Su et al., "Pixel difference networks for efficient edge detection" (2021). Its convolutions take differences
+of neighbouring pixels. A difference is linear, so each is an ordinary convolution with another kernel; the
+kernels are turned into those once, when the file is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, interpolate, max_pool2d
+
+from bigs.checks import InputError
+from bigs.weights import checked_weight, load_weights
+
+# Blocks of each of the four scales; with the first convolution these are 16 layers.
+_BLOCKS = (3, 4, 4, 4)
+# The kinds of kernels, in turns over the layers: to the centre, around the ring, outwards, ordinary.
+_KINDS = ("central", "angular", "radial", "ordinary")
+# For each place of a 3 x 3 kernel, row by row, the place that is taken away from it.
+_AROUND = (3, 0, 1, 6, 4, 2, 7, 8, 5)
+# Where a radial kernel's weights, save the first, go in 5 x 5: on the outer ring, negated on the inner one.
+_OUTER = (0, 2, 4, 10, 14, 20, 22, 24)
+_INNER = (6, 7, 8, 11, 13, 16, 17, 18)
+# How far the four convolutions of the module that gathers context are spread.
+_DILATIONS = (5, 7, 9, 11)
+
+
+@dataclass(frozen=True)
+class PiDiNet:
+    """The network; called with pictures it returns their edges."""
+
+    weights: dict[str, Tensor]  # by their published names; difference kernels are ordinary ones here
+
+    @torch.no_grad()
+    def __call__(self, images: Tensor) -> Tensor:
+        """Edges [B, 1, H, W] in [0, 1] of pictures [B, 3, H, W] in [0, 1], RGB.
+
+        The network is given blue, green, red in [0, 1], unnormalised, as were the edges that the published
+        soft-edge ControlNet was trained with.
+        """
+        height, width = images.shape[-2:]
+        weights = {name: value.to(images) for name, value in self.weights.items()}
+        x = _convolved(images.flip(1), weights, "init_block")
+        maps = []
+        for scale, blocks in enumerate(_BLOCKS):
+            for block in range(1, blocks + 1):
+                x = _block(x, weights, f"block{scale + 1}_{block}", halve=scale > 0 and block == 1)
+            edges = _convolved(_context(x, weights, scale), weights, f"conv_reduces.{scale}.conv")
+            maps.append(interpolate(edges, (height, width), mode="bilinear", align_corners=False))
+        return _convolved(torch.cat(maps, 1), weights, "classifier").sigmoid()
+
+
+def load_pidinet(path: Path) -> PiDiNet:
+    """The network in a file: of any width, with or without its context and attention modules.
+
+    Both kinds of published files are read: those of difference kernels, in the arrangement "carv4", and those
+    already turned into ordinary ones.
+
+    Raises:
+        InputError: the file is missing or unreadable, or a layer is missing or of another shape.
+    """
+    found = {name.removeprefix("module."): value for name, value in load_weights(path, "PiDiNet").items()}
+    weights: dict[str, Tensor] = {}
+
+    def take(name: str, *shape: int | None) -> int:
+        """Keep a tensor; returns its first axis, which is the number of channels that a layer makes."""
+        if name not in found:
+            raise InputError(f"{path}: expected PiDiNet as its authors name it, found no {name}")
+        weights[name] = checked_weight(f"{path}: {name}", found[name], shape)
+        return len(weights[name])
+
+    converted = found.get("block1_2.conv1.weight", torch.empty(0)).shape[-1:] == (5,)
+
+    def take_kernel(name: str, layer: int, *shape: int | None) -> int:
+        kind = _KINDS[layer % len(_KINDS)]
+        side = 5 if converted and kind == "radial" else 3
+        made = take(name, *shape, side, side)
+        if not converted:
+            weights[name] = ordinary_kernel(weights[name], kind)
+        return made
+
+    width = channels = take_kernel("init_block.weight", 0, None, 3)
+    layer = 1
+    for scale, blocks in enumerate(_BLOCKS):
+        out = width * min(2**scale, 4)
+        for block in range(1, blocks + 1):
+            name = f"block{scale + 1}_{block}"
+            take_kernel(f"{name}.conv1.weight", layer, channels, 1)
+            take(f"{name}.conv2.weight", out, channels, 1, 1)
+            if scale > 0 and block == 1:
+                take(f"{name}.shortcut.weight", out, channels, 1, 1)
+                take(f"{name}.shortcut.bias", out)
+            channels = out
+            layer += 1
+        read = channels
+        if any(name.startswith(f"dilations.{scale}.") for name in found):
+            read = take(f"dilations.{scale}.conv1.weight", None, channels, 1, 1)
+            take(f"dilations.{scale}.conv1.bias", read)
+            for index in range(len(_DILATIONS)):
+                take(f"dilations.{scale}.conv2_{index + 1}.weight", read, read, 3, 3)
+        if any(name.startswith(f"attentions.{scale}.") for name in found):
+            inner = take(f"attentions.{scale}.conv1.weight", None, read, 1, 1)
+            take(f"attentions.{scale}.conv1.bias", inner)
+            take(f"attentions.{scale}.conv2.weight", 1, inner, 3, 3)
+        take(f"conv_reduces.{scale}.conv.weight", 1, read, 1, 1)
+        take(f"conv_reduces.{scale}.conv.bias", 1)
+    take("classifier.weight", 1, len(_BLOCKS), 1, 1)
+    take("classifier.bias", 1)
+    return PiDiNet(weights)
+
+
+def ordinary_kernel(kernel: Tensor, kind: str) -> Tensor:
+    """The kernel [O, I, k, k] that sums the differences which `kernel` [O, I, 3, 3] weighs.
+
+    - central: each neighbour minus the centre;
+    - angular: each neighbour minus the next one clockwise;
+    - radial: each pixel two steps out minus the one a step out in the same direction, so that k is 5; the
+      first weight is not used;
+    - ordinary: no differences.
+    """
+    flat = kernel.flatten(2)
+    if kind == "central":
+        flat = flat.clone()
+        flat[..., 4] -= kernel.sum((2, 3))
+    elif kind == "angular":
+        flat = flat - flat[..., list(_AROUND)]
+    elif kind == "radial":
+        weights = flat[..., 1:]
+        flat = flat.new_zeros(*flat.shape[:2], 25)
+        flat[..., list(_OUTER)] = weights
+        flat[..., list(_INNER)] = -weights
+    side = 5 if kind == "radial" else 3
+    return flat.unflatten(2, (side, side))
+
+
+def _convolved(
+    x: Tensor, weights: dict[str, Tensor], name: str, dilation: int = 1, groups: int = 1
+) -> Tensor:
+    """A layer that keeps the size of its input."""
+    kernel = weights[f"{name}.weight"]
+    padding = dilation * (kernel.shape[-1] // 2)
+    bias = weights.get(f"{name}.bias")
+    return conv2d(x, kernel, bias, padding=padding, dilation=dilation, groups=groups)
+
+
+def _block(x: Tensor, weights: dict[str, Tensor], name: str, halve: bool) -> Tensor:
+    if halve:
+        x = max_pool2d(x, 2)
+    differences = _convolved(x, weights, f"{name}.conv1", groups=x.shape[1]).relu()
+    passed = _convolved(x, weights, f"{name}.shortcut") if halve else x
+    return _convolved(differences, weights, f"{name}.conv2") + passed
+
+
+def _context(x: Tensor, weights: dict[str, Tensor], scale: int) -> Tensor:
+    """Features of one scale, with surroundings gathered and background held down if the file can."""
+    name = f"dilations.{scale}"
+    if f"{name}.conv1.weight" in weights:
+        x = _convolved(x.relu(), weights, f"{name}.conv1")
+        x = torch.stack(
+            [_convolved(x, weights, f"{name}.conv2_{i + 1}", dilation=d) for i, d in enumerate(_DILATIONS)]
+        ).sum(0)
+    name = f"attentions.{scale}"
+    if f"{name}.conv1.weight" in weights:
+        share = _convolved(_convolved(x.relu(), weights, f"{name}.conv1"), weights, f"{name}.conv2")
+        x = x * share.sigmoid()
+    return x
