@@ -64,7 +64,7 @@ def sds_loss(
         if config.max_grad_norm is not None:
             gradient = limited(gradient, config.max_grad_norm)
     loss: Tensor = _GivenGradient.apply(latents, gradient / len(latents))
-    return loss
+    return loss.to(images.device)  # the prior may live elsewhere
 
 
 def add_noise(latents: Tensor, noise: Tensor, timesteps: Tensor, alphas_cumprod: Tensor) -> Tensor:
