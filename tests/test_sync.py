@@ -10,7 +10,7 @@ from pathlib import Path
 
 import bigs
 from bigs.cli import main, runs, terminal
-from bigs.commands.run_folder import FORMATS
+from bigs.commands.formats import FORMATS
 from bigs.train.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]

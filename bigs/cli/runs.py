@@ -23,8 +23,21 @@ from bigs.cli.terminal import (
 if TYPE_CHECKING:
     from bigs.commands.reconstruct import Outcome
 
-# The names of `commands.run_folder.FORMATS`; a test compares.
-Format = Literal["ply", "poses", "challenge", "mesh", "hand-meshes"]
+# The names of `commands.formats.FORMATS`; a test compares.
+Format = Literal[
+    "ply",
+    "spz",
+    "splat-glb",
+    "glb",
+    "obj",
+    "mesh",
+    "hand-meshes",
+    "rerun",
+    "poses",
+    "mano",
+    "arctic",
+    "challenge",
+]
 
 
 def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0, seed: int = 0) -> None:
@@ -135,17 +148,40 @@ def render(run: Annotated[Path, tyro.conf.Positional], cameras: Path, out: Path,
     say(f"{len(files)} pictures in {out}")
 
 
-def export(run: Annotated[Path, tyro.conf.Positional], format: Format, out: Path | None = None) -> None:
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    format: Format,
+    out: Path | None = None,
+    frames: tuple[int, ...] = (),
+    all_frames: bool = False,
+    clip: Path | None = None,
+) -> None:
     """Write a finished run in another program's format.
 
     Args:
         run: the run folder.
-        format: ply (Gaussians), poses (npz), challenge (.pt), mesh (object), or hand-meshes (every frame).
+        format: Gaussians: ply (each subject unposed, or posed at chosen frames), spz, splat-glb (glTF with
+            KHR_gaussian_splatting). Meshes: glb (animated: hands with skeletons, object), obj (all subjects
+            at chosen frames), mesh (object), hand-meshes (every frame). Poses: poses (npz), mano, arctic,
+            challenge (.pt). All together over time: rerun.
         out: where to write; the run folder if not given.
+        frames: times to write, for ply, spz, splat-glb, obj and hand-meshes.
+        all_frames: write every time, for the same formats.
+        clip: the clip with the input images, for rerun, if it is not where the run found it.
     """
-    from bigs.commands.run_folder import load_run, write_format
+    from bigs.checks import InputError
+    from bigs.commands.formats import Choice, write_format
+    from bigs.commands.run_clip import clip_of_run
+    from bigs.commands.run_folder import load_run
 
-    files = write_format(run if out is None else out, load_run(run), format)
+    if frames and all_frames:
+        raise InputError("--all-frames: expected this or --frames, found both")
+    if clip is not None and format != "rerun":
+        raise InputError(f"--clip: expected the format rerun, which holds images, found {format}")
+    playback = load_run(run)
+    wanted = tuple(range(len(playback))) if all_frames else frames or None
+    images = clip_of_run(run, len(playback), clip) if format == "rerun" else None
+    files = write_format(run if out is None else out, playback, format, Choice(wanted, images))
     for path in files if len(files) <= 10 else [files[0], "...", files[-1]]:
         say(str(path))
 

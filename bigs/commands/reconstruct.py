@@ -15,6 +15,7 @@ import bigs
 from bigs.atomic import remove_parts
 from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
+from bigs.commands.formats import FPS, write_outputs
 from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
 from bigs.commands.run_folder import (
     CHECKPOINTS,
@@ -25,7 +26,6 @@ from bigs.commands.run_folder import (
     PREVIEW_VIDEO,
     REPORT,
     write_json,
-    write_outputs,
 )
 from bigs.commands.run_lock import only_writer
 from bigs.commands.run_log import RunLog
@@ -47,7 +47,6 @@ from bigs.viewer.report import write_report
 
 # Degrees by which the preview's novel view is turned about the scene.
 _NOVEL_VIEW = 40.0
-_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ def _write_preview(
                 )
                 for t in range(len(clip))
             ),
-            _FPS,
+            FPS,
         )
     except InputError as missing:
         report.skipped.append(f"{PREVIEW_VIDEO}: {missing}")

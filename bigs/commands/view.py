@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 
-from bigs.checks import InputError
-from bigs.commands.run_folder import CONFIG, load_run
+from bigs.commands.run_clip import clip_of_run
+from bigs.commands.run_folder import load_run
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.geometry.rotations import axis_angle_to_matrix, quat_to_matrix
 from bigs.metrics.report import match_frames
 from bigs.models.playback import Playback
@@ -51,7 +49,7 @@ def view(
     """
     playback = load_run(run)
     truth = None if gt is None else load_ground_truth(gt)
-    return Viewer(make_stage(playback, _clip_of(run, playback, clip), truth), host, port)
+    return Viewer(make_stage(playback, clip_of_run(run, len(playback), clip), truth), host, port)
 
 
 def make_stage(playback: Playback, clip: Clip | None, truth: HandObjectTrajectory | None) -> Stage:
@@ -82,21 +80,6 @@ def make_stage(playback: Playback, clip: Clip | None, truth: HandObjectTrajector
         image=None if clip is None else clip.image,
         truth=None if truth is None else _truth(playback, truth),
     )
-
-
-def _clip_of(run: Path, playback: Playback, given: Path | None) -> Clip | None:
-    """The clip with the input images. One that was moved or changed since is not worth a refusal."""
-    if given is not None:
-        clip = load_hold(given)
-        if len(clip) != len(playback):
-            raise InputError(f"{given}: expected the {len(playback)} frames of {run}, found {len(clip)}")
-        return clip
-    try:
-        stored = yaml.safe_load((run / CONFIG).read_text())
-        clip = load_hold(Path(stored["clip"]))
-    except (OSError, yaml.YAMLError, InputError, KeyError, TypeError):
-        return None
-    return clip if len(clip) == len(playback) else None
 
 
 @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,3 +49,18 @@ def save_mesh(
     content: Any = mesh.export(file_type=kind)
     with atomic_write(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+def save_meshes(path: str | Path, meshes: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Write several meshes as one OBJ file with an object for each name; `path` is whole or absent.
+
+    Args:
+        path: the .obj file.
+        meshes: name -> vertices [V, 3] metres, written as they are, and faces [F, 3].
+    """
+    scene = trimesh.Scene()
+    for name, (verts, faces) in meshes.items():
+        scene.add_geometry(trimesh.Trimesh(verts, faces, process=False), geom_name=name)
+    content: Any = scene.export(file_type="obj")
+    with atomic_write(path) as file:
+        file.write(content.encode())

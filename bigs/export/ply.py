@@ -56,30 +56,42 @@ def save_splats(path: str | Path, gaussians: Gaussians) -> None:
     Raises:
         InputError: a shape does not fit, or a value is not finite.
     """
-    count = len(gaussians.means)
-    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3))
-    columns = {}
-    for name, values, shape in zip(Gaussians._fields, gaussians, shapes, strict=True):
-        check_shape(f"{path}: {name}", values, shape)
-        check_finite(f"{path}: {name}", values)
-        columns[name] = values.detach().cpu().double()
-    opacities = columns["opacities"].clamp(_OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)
-    table = torch.cat(
-        (
-            columns["means"],
-            torch.zeros(count, 3, dtype=torch.float64),
-            (columns["colors"] - 0.5) / SH_C0,
-            torch.logit(opacities)[:, None],
-            columns["scales"].clamp_min(_MIN_SCALE).log(),
-            torch.nn.functional.normalize(columns["quats"], dim=-1),
-        ),
-        dim=1,
-    )
+    check_splats(str(path), gaussians)
+    means, quats, log_scales, logits, harmonics = stored_form(gaussians)
+    count = len(means)
+    unused_normals = torch.zeros(count, 3, dtype=torch.float64)
+    table = torch.cat((means, unused_normals, harmonics, logits[:, None], log_scales, quats), dim=1)
     properties = "".join(f"property float {name}\n" for name in _WRITTEN)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
     with atomic_write(path) as file:
         file.write(header.encode("ascii"))
         file.write(table.numpy().astype("<f4").tobytes())
+
+
+def check_splats(where: str, gaussians: Gaussians) -> None:
+    """Refuse what is not one set of N Gaussians with three colour channels.
+
+    Raises:
+        InputError: a shape does not fit, or a value is not finite.
+    """
+    count = len(gaussians.means)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3))
+    for name, values, shape in zip(Gaussians._fields, gaussians, shapes, strict=True):
+        check_shape(f"{where}: {name}", values, shape)
+        check_finite(f"{where}: {name}", values)
+
+
+def stored_form(gaussians: Gaussians) -> Gaussians:
+    """The numbers that splat files hold, float64: unit quaternions, logarithms of scales, logits of
+    opacities, constant harmonics for colours."""
+    means, quats, scales, opacities, colors = (values.detach().cpu().double() for values in gaussians)
+    return Gaussians(
+        means,
+        torch.nn.functional.normalize(quats, dim=-1),
+        scales.clamp_min(_MIN_SCALE).log(),
+        torch.logit(opacities.clamp(_OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)),
+        (colors - 0.5) / SH_C0,
+    )
 
 
 def load_splats(path: str | Path) -> Gaussians:

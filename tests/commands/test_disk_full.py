@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from command_line import Answer, Run, assert_refused, contents
 
-from bigs.commands.run_folder import FORMATS, load_run, write_format, write_outputs
+from bigs.commands.formats import FORMATS, write_format, write_outputs
+from bigs.commands.run_folder import load_run
 from bigs.commands.run_log import RunLog, read_log
 
 resource = pytest.importorskip("resource")

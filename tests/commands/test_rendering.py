@@ -13,8 +13,9 @@ import torch
 from command_line import Answer, Run
 from PIL import Image
 
+from bigs.commands.formats import FORMATS
 from bigs.commands.rendering import orbit_camera, render_input_view, straight_rgba
-from bigs.commands.run_folder import FORMATS, load_run
+from bigs.commands.run_folder import load_run
 from bigs.data.base import Clip
 from bigs.models.playback import Playback
 from bigs.raster import rasterization
