@@ -1,15 +1,19 @@
-"""The clip that a run was made from, for what shows its images."""
+"""The clip and the hand models that a run was made from, for what shows images or truth beside it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from bigs.checks import InputError
+from bigs.commands.clips import open_clip
 from bigs.commands.run_folder import CONFIG
 from bigs.data.base import Clip
-from bigs.data.hold import load_hold
+from bigs.hand import HandModel, load_hand_models
+from bigs.types import Side
 
 
 def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | None:
@@ -22,12 +26,31 @@ def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | Non
         InputError: the given clip is not as it should be, or not the run's.
     """
     if given is not None:
-        clip = load_hold(given)
+        clip = open_clip(given, load_hand_models(None))
         if len(clip) != frames:
             raise InputError(f"{given}: expected the {frames} frames of {run}, found {len(clip)}")
         return clip
     try:
-        clip = load_hold(Path(yaml.safe_load((run / CONFIG).read_text())["clip"]))
-    except (OSError, yaml.YAMLError, InputError, KeyError, TypeError):
+        clip = open_clip(Path(_origin(run)["clip"]), load_hand_models(None))
+    except (InputError, KeyError, TypeError):
         return None
     return clip if len(clip) == frames else None
+
+
+def hand_models_of_run(run: Path) -> Mapping[Side, HandModel]:
+    """The models that a run was made with; the built-in ones if theirs are gone.
+
+    Raises:
+        InputError: the models' files are there and not as they should be.
+    """
+    stored = _origin(run).get("hand_model")
+    return load_hand_models(Path(stored) if stored and Path(stored).exists() else None)
+
+
+def _origin(run: Path) -> Mapping[str, Any]:
+    """What config.yaml says; nothing when it cannot be read."""
+    try:
+        found = yaml.safe_load((run / CONFIG).read_text())
+    except (OSError, yaml.YAMLError):
+        return {}
+    return found if isinstance(found, dict) else {}

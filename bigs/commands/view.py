@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bigs.commands.run_clip import clip_of_run
+from bigs.commands.run_clip import clip_of_run, hand_models_of_run
 from bigs.commands.run_folder import load_run
+from bigs.commands.truth import load_truth
 from bigs.data.base import Clip
-from bigs.data.ground_truth import load_ground_truth
 from bigs.geometry.rotations import axis_angle_to_matrix, quat_to_matrix
 from bigs.metrics.report import match_frames
 from bigs.models.playback import Playback
@@ -48,7 +48,7 @@ def view(
             address cannot be listened at.
     """
     playback = load_run(run)
-    truth = None if gt is None else load_ground_truth(gt)
+    truth = None if gt is None else load_truth(gt, playback.frame_names, hand_models_of_run(run))
     return Viewer(make_stage(playback, clip_of_run(run, len(playback), clip), truth), host, port)
 
 
