@@ -14,7 +14,7 @@ import tyro
 
 from bigs import __version__
 from bigs.checks import InputError
-from bigs.cli import bench, runs
+from bigs.cli import bench, runs, scores
 from bigs.cli.terminal import fail, say
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -23,7 +23,8 @@ COMMANDS: Commands = {
     "demo": runs.demo,
     "info": runs.info,
     "reconstruct": runs.reconstruct,
-    "eval": runs.evaluate,
+    "eval": scores.evaluate,
+    "submission": scores.submission,
     "render": runs.render,
     "export": runs.export,
     "view": runs.view,

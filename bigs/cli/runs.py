@@ -93,7 +93,8 @@ def reconstruct(
         out: the run folder to make.
         preset: smoke (seconds), demo, fast (two minutes), full, or paper (the paper's equations and weights).
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        gt: ground truth (gt.npz) to score against; the reconstruction never sees it.
+        gt: ground truth to score against, which the reconstruction never sees: gt.npz, an ARCTIC raw sequence
+            or an HO-3D clip.
         resume: continue an interrupted run in the same folder.
         config: a config.yaml of an earlier run, instead of a preset.
         set: change one setting, as path=value (raster.eps2d=0.2, stages.hands-fine.steps=50); repeatable.
@@ -118,18 +119,6 @@ def reconstruct(
     for name in unused:
         say(f"--without {name}: this plan has nothing of it")
     show(outcome)
-
-
-def evaluate(run: Annotated[Path, tyro.conf.Positional], gt: Path) -> None:
-    """Score a finished run against ground truth, with the field's own definitions.
-
-    Args:
-        run: the run folder.
-        gt: ground truth file (gt.npz) or the clip folder that holds it.
-    """
-    from bigs.commands.evaluation import evaluate_run
-
-    print_table(evaluate_run(run, gt))
 
 
 def render(run: Annotated[Path, tyro.conf.Positional], cameras: Path, out: Path, threads: int = 0) -> None:

@@ -14,8 +14,8 @@ from bigs.bench.page import Table, page
 from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
 from bigs.commands.run_folder import write_json
-from bigs.commands.series import FinishedRun, PlannedRun, check_folders, find_ground_truth, run_or_reuse
-from bigs.commands.truth import load_truth
+from bigs.commands.series import FinishedRun, PlannedRun, check_folders, run_or_reuse
+from bigs.commands.truth import find_ground_truth, load_truth
 from bigs.hand import load_hand_models
 from bigs.metrics.report import METRICS
 from bigs.train.config import RunConfig

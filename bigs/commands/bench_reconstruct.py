@@ -21,7 +21,8 @@ from bigs.checks import InputError, check_choice
 from bigs.commands.clips import open_estimates
 from bigs.commands.growth import measure, probes
 from bigs.commands.run_folder import write_json
-from bigs.commands.series import PlannedRun, check_folders, find_ground_truth, run_or_reuse
+from bigs.commands.series import PlannedRun, check_folders, run_or_reuse
+from bigs.commands.truth import find_ground_truth
 from bigs.data.ground_truth import load_ground_truth
 from bigs.hand import load_hand_models
 from bigs.train.config import RunConfig

@@ -1,25 +1,212 @@
-"""Scores of a finished run."""
+"""Scores of finished runs: against ground truth, on the clip's own frames, and from views held back."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from bigs.commands.run_folder import METRICS, load_run, write_json
-from bigs.data.ground_truth import load_ground_truth
-from bigs.metrics.report import comparison_table, evaluate
+import numpy as np
+import yaml
+
+from bigs.atomic import atomic_write
+from bigs.bench.page import Table, page
+from bigs.checks import InputError
+from bigs.commands.clips import open_clip
+from bigs.commands.paper_tables import beside_paper, mean_scores
+from bigs.commands.pictures import frame_scores, means, novel_scores
+from bigs.commands.run_folder import CONFIG, METRICS, load_run, write_json
+from bigs.commands.truth import find_ground_truth, load_truth
+from bigs.data.base import Clip
+from bigs.data.novel import CAMERAS
+from bigs.hand import HandModel, load_hand_models
+from bigs.losses.perceptual import VggWeights, perceptual_distance
+from bigs.losses.perceptual_file import load_perceptual_weights
+from bigs.metrics.picture import ALL_METRICS, Distance
+from bigs.metrics.report import comparison_table, evaluate, match_frames, per_frame
+from bigs.models.playback import Playback
+from bigs.types import Side
+
+FRAMES = "frames.csv"
+COMPARISON = "comparison.md"
+COMPARISON_NUMBERS = "comparison.csv"
+
+# What the official code does differently from what it says; it stands below every comparison.
+OFFICIAL_NOTES = (
+    "The public ARCTIC evaluator computes CD_r and CD_l from plain distances and prints cm, the HO-3D "
+    "evaluator from squared ones (cm²), and the paper labels both cm²: `cd_r_sq` and `cd_l_sq` are squared, "
+    "`cd_r` and `cd_l` plain. Both sums run over the two directions and are not halved. For CD_o the ARCTIC "
+    "evaluator scores its first alignment with plain and 600 others with squared distances and prints "
+    "the smallest number: `cd_icp_sq` and `cd_icp` are two forms of one alignment, `cd_icp_arctic` is the "
+    "smaller. That evaluator draws its samples without a seed; here nothing changes from run to run."
+)
 
 
-def evaluate_run(run: Path, ground_truth: Path) -> list[tuple[str, ...]]:
-    """Score a run, write `metrics.json`, and return the table; scores of the initial estimates stay beside.
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """What a run is scored with; what is not given is taken from the run's own clip, where that is there."""
+
+    ground_truth: Path | None = None  # see `load_truth`
+    clip: Path | None = None  # for its images and masks
+    novel: Path | None = None  # see `load_novel_views`
+    hand_model: Path | None = None  # for a data set's poses
+    perceptual_weights: tuple[Path, ...] = ()  # VGG-16 and LPIPS's channel weights
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The scores of one run."""
+
+    name: str  # of the clip
+    scores: dict[str, dict[str, float]]  # "result", and "initial" where the run had it, by key
+    frames: dict[str, np.ndarray]  # by key, [T]
+    missing: tuple[str, ...]  # what could not be scored, and why
+
+    def table(self) -> list[tuple[str, ...]]:
+        """All scores as rows of text."""
+        return comparison_table(self.scores, ALL_METRICS, details=True)
+
+
+def evaluate_run(
+    run: Path, plan: EvaluationPlan, listen: Callable[[str], None] = lambda text: None
+) -> Evaluation:
+    """Score a run into its `metrics.json`, which keeps its initial estimates' scores, and `frames.csv`.
 
     Raises:
-        InputError: the run or the truth is not as it should be, or they list different frames.
+        InputError: the run, the truth or the clip is not as it should be, they list different frames, or
+            there is nothing to score against.
     """
     playback = load_run(run)
-    result = evaluate(playback.trajectory(), load_ground_truth(ground_truth))
+    origin = yaml.safe_load((run / CONFIG).read_text()) if (run / CONFIG).is_file() else {}
+    hand_file = plan.hand_model or (Path(origin["hand_model"]) if origin.get("hand_model") else None)
+    hand_models = load_hand_models(hand_file)
+    clip_path = plan.clip or (Path(origin["clip"]) if origin.get("clip") else None)
+    distance = _perceptual(plan.perceptual_weights)
+    clip = _open_frames(clip_path, hand_models, playback, given=plan.clip is not None)
+    truth_path = plan.ground_truth or (find_ground_truth(clip_path) if clip_path else None)
+    if clip is None and truth_path is None and plan.novel is None:
+        raise InputError(
+            f"{run}: expected something to score against (--gt, --clip or --novel), found neither "
+            f"that nor the run's own clip {clip_path}"
+        )
+    missing: list[str] = []
+    result: dict[str, float] = {}
+    frames: dict[str, np.ndarray] = {}
+    if truth_path is None:
+        missing.append("poses and shapes: no ground truth (--gt)")
+    else:
+        listen(f"{run.name}: poses and shapes")
+        truth = load_truth(truth_path, playback.frame_names, hand_models)
+        result |= evaluate(playback.trajectory(), truth)
+        order = match_frames(truth.frame_names, playback.frame_names)
+        frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
+    if clip is None:
+        missing.append("pictures: the run's clip is not there (--clip)")
+    else:
+        listen(f"{run.name}: pictures")
+        pictures = frame_scores(clip, playback, distance)
+        frames |= pictures
+        result |= means(pictures)
+    novel = plan.novel or _own_novel(clip_path)
+    if novel is not None:
+        listen(f"{run.name}: held-back views")
+        result |= novel_scores(playback, novel, distance)
+    if distance is None:
+        missing.append("LPIPS: no weights (--perceptual-weights)")
     path = run / METRICS
     scores = json.loads(path.read_text()) if path.exists() else {}
     scores["result"] = scores.get("result", {}) | result
     write_json(path, scores)
-    return comparison_table(scores)
+    _write_frames(run / FRAMES, playback.frame_names, frames)
+    return Evaluation(playback.name, scores, frames, tuple(missing))
+
+
+def run_names(runs: Sequence[Path]) -> list[str]:
+    """What runs are called in a table: their folders' names, or the paths where those are not enough.
+
+    Raises:
+        InputError: a folder comes twice.
+    """
+    folders = [run.resolve() for run in runs]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(f"{folder}: expected each run once, found it again")
+    names = [folder.name for folder in folders]
+    return names if len(set(names)) == len(names) else [str(run) for run in runs]
+
+
+def compare_runs(runs: Mapping[str, Evaluation], out: Path) -> list[Table]:
+    """Write the scores of several runs beside the paper's: `comparison.md` and, with every score, a CSV."""
+    out.mkdir(parents=True, exist_ok=True)
+    results = {name: evaluation.scores["result"] for name, evaluation in runs.items()}
+    tables = beside_paper(results)
+    columns = results | ({"mean": mean_scores(results)} if len(results) > 1 else {})
+    everything = Table("All scores", OFFICIAL_NOTES, comparison_table(columns, ALL_METRICS, details=True))
+    keys = [key for key in ALL_METRICS if any(key in scores for scores in results.values())]
+    _write_csv(
+        out / COMPARISON_NUMBERS,
+        ["run", "clip", *keys],
+        [[name, runs[name].name, *(scores.get(key, "") for key in keys)] for name, scores in results.items()],
+    )
+    text = page(
+        "Runs compared", "Scores of finished runs, and the paper's beside them.", [*tables, everything]
+    )
+    with atomic_write(out / COMPARISON) as file:
+        file.write(text.encode())
+    return tables
+
+
+def _perceptual(files: Sequence[Path]) -> Distance | None:
+    if not files:
+        return None
+    network: VggWeights = load_perceptual_weights(files)
+    if network.channel_weights is None:
+        raise InputError(
+            f"--perceptual-weights: expected LPIPS's channel weights (lin0 to lin4) beside VGG-16, found "
+            f"only {' and '.join(map(str, files))}"
+        )
+    return lambda pred, gt: perceptual_distance(pred, gt, network)
+
+
+def _open_frames(
+    path: Path | None, hand_models: Mapping[Side, HandModel], playback: Playback, *, given: bool
+) -> Clip | None:
+    """The clip with the run's frames; None when the run's own is gone or has no masks."""
+    if path is None or (not given and not path.exists()):
+        return None
+    clip = open_clip(path, hand_models)
+    if clip.frame_names != playback.frame_names:
+        raise InputError(
+            f"{path}: expected the run's {len(playback)} frames from {playback.frame_names[0]} on, found "
+            f"{len(clip)} from {clip.frame_names[0]} on"
+        )
+    if not clip.mask_paths:
+        if given:
+            raise InputError(f"{path}: expected a clip with masks, found none")
+        return None
+    return clip
+
+
+def _own_novel(clip_path: Path | None) -> Path | None:
+    """The views held back of a clip, beside its build folder."""
+    if clip_path is None:
+        return None
+    folder = (clip_path.parent if clip_path.name == "build" else clip_path) / "novel"
+    return folder if (folder / CAMERAS).is_file() else None
+
+
+def _write_frames(path: Path, names: Sequence[str], columns: Mapping[str, np.ndarray]) -> None:
+    rows = [[t, name, *(f"{values[t]:.6g}" for values in columns.values())] for t, name in enumerate(names)]
+    _write_csv(path, ["frame", "name", *columns], rows)
+
+
+def _write_csv(path: Path, heading: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(heading)
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())

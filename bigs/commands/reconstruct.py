@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from bigs.atomic import remove_parts
 from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
 from bigs.commands.formats import FPS, write_outputs
+from bigs.commands.pictures import frame_scores, means
 from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
 from bigs.commands.run_folder import (
     CHECKPOINTS,
@@ -33,7 +34,7 @@ from bigs.commands.truth import load_truth
 from bigs.data.base import Clip
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
-from bigs.metrics.image import psnr, ssim
+from bigs.metrics.picture import ALL_METRICS
 from bigs.metrics.report import comparison_table, evaluate
 from bigs.models.playback import Playback, record
 from bigs.train.checkpoint import FILE_NAME
@@ -128,7 +129,7 @@ def reconstruct(
             for line in report.skipped:
                 log_and_listen({"event": "skipped", "text": line})
         write_json(out / METRICS, scores)
-        table = comparison_table(scores) + _image_rows(scores)
+        table = comparison_table(scores, ALL_METRICS)
         _write_preview(out, clip, playback, table, log.events, report)
         return Outcome(out, table, report, report.before + time.perf_counter() - began)
 
@@ -146,31 +147,7 @@ def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None
 def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -> dict[str, float]:
     """Image scores on the clip's own frames, and the pose and shape scores when there is a truth."""
     scores = {} if truth is None else evaluate(playback.trajectory(), truth)
-    pairs = []
-    for t in range(len(clip)):
-        mask = torch.from_numpy(clip.mask(t) != 0)
-        if mask.any():
-            color, _ = render_input_view(playback, t)
-            image = torch.from_numpy(clip.image(t)).float() / 255.0
-            pred, target = (x.permute(2, 0, 1)[None] for x in (torch.from_numpy(color).clamp(0, 1), image))
-            pairs.append((float(psnr(pred, target, mask[None])), float(ssim(pred * mask, target * mask))))
-    if pairs:
-        scores["psnr_foreground"], scores["ssim_foreground"] = map(float, np.mean(pairs, axis=0))
-    return scores
-
-
-def _image_rows(scores: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
-    """Rows for what only a rendering has, in the shape of `comparison_table`'s."""
-    labels = {
-        "psnr_foreground": ("PSNR of the foreground", "dB"),
-        "ssim_foreground": ("SSIM of the foreground", ""),
-    }
-    rows = []
-    for key, (label, unit) in labels.items():
-        if key in scores["result"]:
-            cells = [f"{column[key]:.2f}" if key in column else "" for column in scores.values()]
-            rows.append((label, unit, *cells, *([""] if len(scores) > 1 else [])))
-    return rows
+    return scores | means(frame_scores(clip, playback))
 
 
 def _write_preview(

@@ -69,12 +69,6 @@ def check_folders(runs: list[PlannedRun]) -> None:
                 )
 
 
-def find_ground_truth(clip: Path) -> Path | None:
-    """The gt.npz of a clip, beside its build folder; None when it has none."""
-    places = (clip, clip.resolve().parent) if clip.resolve().name == "build" else (clip,)
-    return next((place / "gt.npz" for place in places if (place / "gt.npz").is_file()), None)
-
-
 def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> FinishedRun:
     """Run unless the folder holds the finished run; one that was interrupted goes on where it was.
 

@@ -50,6 +50,12 @@ def load_truth(
     )
 
 
+def find_ground_truth(clip: Path) -> Path | None:
+    """The gt.npz of a clip, beside its build folder; None when it has none."""
+    places = (clip, clip.resolve().parent) if clip.resolve().name == "build" else (clip,)
+    return next((place / "gt.npz" for place in places if (place / "gt.npz").is_file()), None)
+
+
 @torch.no_grad()
 def pose_annotation(annotation: Annotation, hand_models: Mapping[Side, HandModel]) -> HandObjectTrajectory:
     """An annotation as joints and meshes in the camera's frame, in double precision."""

@@ -13,7 +13,7 @@ import pickle
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -124,19 +124,28 @@ def load_challenge(path: str | Path, frame_names: Sequence[str] | None = None) -
     )
 
 
-def validate_challenge(path: str | Path) -> None:
-    """Check that a prediction file has every key of the challenge, and that they fit together.
+def validate_challenge(path: str | Path, stream: BinaryIO | None = None) -> dict[str, Any]:
+    """Check that a prediction file has every key of the challenge in its type, and that they fit together.
+
+    Args:
+        path: `<sequence>.pt`, or what to call it in messages.
+        stream: its bytes, where they lie elsewhere than in that file.
+
+    Returns:
+        What the file holds, faces apart as `faces`.
 
     Raises:
         InputError: the first thing that is wrong.
     """
-    content = _read(Path(path))
+    content = _read(Path(path)) if stream is None else _parse(str(path), stream)
     _check(str(path), content)
     present = _entities(content)
     wanted = [key for key in _shapes(present, 0, {}) if key not in content]
     wanted += [f"faces.{entity}" for entity in present if entity not in content["faces"]]
     if wanted:
         raise InputError(f"{path}: expected a field {wanted[0]}, found none")
+    _check_types(str(path), content)
+    return content
 
 
 def _camera_space(where: str, trajectory: HandObjectTrajectory) -> dict[str, np.ndarray]:
@@ -198,23 +207,29 @@ def _faces(
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: expected a challenge prediction file, found no such file")
+    with path.open("rb") as stream:
+        return _parse(str(path), stream)
+
+
+def _parse(where: str, stream: BinaryIO) -> dict[str, Any]:
     try:
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            content = torch.load(stream, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
+            stream.seek(0)
             with torch.serialization.safe_globals(_HOLD_DICTIONARY):
-                content = torch.load(path, map_location="cpu", weights_only=True)
+                content = torch.load(stream, map_location="cpu", weights_only=True)
     except Exception as error:  # damage and forbidden contents show up as many kinds of error
         reason = str(error).strip().splitlines()
         raise InputError(
-            f"{path}: expected plain containers and tensors, found what cannot be read safely "
+            f"{where}: expected plain containers and tensors, found what cannot be read safely "
             f"({reason[-1] if reason else type(error).__name__})"
         ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: expected a dictionary, found {type(content).__name__}")
+        raise InputError(f"{where}: expected a dictionary, found {type(content).__name__}")
     flat = dict(_flat(content))
     if "faces" in flat:
-        raise InputError(f"{path}: faces: expected a dictionary, found {type(flat['faces']).__name__}")
+        raise InputError(f"{where}: faces: expected a dictionary, found {type(flat['faces']).__name__}")
     faces = {key.removeprefix("faces."): flat.pop(key) for key in list(flat) if key.startswith("faces.")}
     return {**flat, "faces": faces}
 
@@ -284,6 +299,23 @@ def _check(where: str, content: Mapping[str, Any]) -> None:
                 f"found {int(faces.min())} to {int(faces.max())}"
             )
     _check_roots(where, content)
+
+
+def _check_types(where: str, content: Mapping[str, Any]) -> None:
+    """Points are float16 and faces int16, or int32 where int16 cannot count the vertices."""
+    for key, values in content.items():
+        if isinstance(values, torch.Tensor) and values.dtype != torch.float16:
+            raise InputError(f"{where}: {key}: expected float16, found {_type(values)}")
+    for node, faces in content["faces"].items():
+        verts = content.get(f"v3d_c.{node}")
+        large = verts is not None and verts.shape[1] > np.iinfo(np.int16).max + 1
+        expected = "int32" if large else "int16"
+        if _type(faces) != expected:
+            raise InputError(f"{where}: faces.{node}: expected {expected}, found {_type(faces)}")
+
+
+def _type(values: torch.Tensor) -> str:
+    return str(values.dtype).removeprefix("torch.")
 
 
 def _check_roots(where: str, content: Mapping[str, Any]) -> None:

@@ -21,11 +21,13 @@ class Metric(NamedTuple):
     paper: str  # its name in the paper's tables, or a plain description where the paper has none
     unit: str
     better: Literal["lower", "higher", "neither"]
+    detail: bool = False  # for a whole report; short tables do without it
 
 
 # In the order in which they are printed. The paper labels CD_r, CD_l and CD_o cm², so the squared form
 # carries the paper's names; the public ARCTIC evaluator prints the root form of CD_r and CD_l, which stands
-# beside it.
+# beside it. For CD_o it takes the smaller of one alignment in the root form and 600 in the squared form;
+# `cd_icp_arctic` is that of our one alignment.
 METRICS: dict[str, Metric] = {
     "mpjpe_ra_r": Metric("MPJPE_r", "mm", "lower"),
     "mpjpe_ra_l": Metric("MPJPE_l", "mm", "lower"),
@@ -48,6 +50,16 @@ METRICS: dict[str, Metric] = {
     "f5_cam": Metric("F5, scaled clip", "%", "higher"),
     "f10_cam": Metric("F10, scaled clip", "%", "higher"),
     "clip_scale": Metric("scale given to the clip", "", "neither"),
+    "cd_icp_arctic": Metric("CD_o, forms mixed as ARCTIC's evaluator", "", "lower", detail=True),
+    "cd_ra_sq": Metric("CD, object about its own centre", "cm²", "lower", detail=True),
+    "f5_ra": Metric("F5, object about its own centre", "%", "higher", detail=True),
+    "f10_ra": Metric("F10, object about its own centre", "%", "higher", detail=True),
+    "f5_r": Metric("F5, object about the right wrist", "%", "higher", detail=True),
+    "f10_r": Metric("F10, object about the right wrist", "%", "higher", detail=True),
+    "f5_l": Metric("F5, object about the left wrist", "%", "higher", detail=True),
+    "f10_l": Metric("F10, object about the left wrist", "%", "higher", detail=True),
+    "mrrpe_r": Metric("MRRPE, right wrist to object", "mm", "lower", detail=True),
+    "mrrpe_l": Metric("MRRPE, left wrist to object", "mm", "lower", detail=True),
 }
 
 
@@ -127,12 +139,19 @@ def match_frames(pred_names: Sequence[str], gt_names: Sequence[str]) -> np.ndarr
     return np.array([where[stem] for stem in gt_stems])
 
 
-def comparison_table(rows: Mapping[str, Mapping[str, float]]) -> list[tuple[str, ...]]:
+def comparison_table(
+    rows: Mapping[str, Mapping[str, float]],
+    metrics: Mapping[str, Metric] = METRICS,
+    *,
+    details: bool = False,
+) -> list[tuple[str, ...]]:
     """Columns of scores side by side, as text.
 
     Args:
         rows: what was scored (such as "initial", "result") -> its scores, as `evaluate` gives them. Keys that
-            `METRICS` does not know are left out.
+            `metrics` does not know are left out.
+        metrics: the scores to show, in their order.
+        details: show those that are marked so, too.
 
     Returns:
         The heading ("score", "unit", names..., "change") and one tuple for each score that any of them has;
@@ -141,7 +160,9 @@ def comparison_table(rows: Mapping[str, Mapping[str, float]]) -> list[tuple[str,
     """
     compared = len(rows) > 1
     table = [("score", "unit", *rows, *(["change"] if compared else []))]
-    for key, metric in METRICS.items():
+    for key, metric in metrics.items():
+        if metric.detail and not details:
+            continue
         values = [scores.get(key, np.nan) for scores in rows.values()]
         if not np.isfinite(values).any():
             continue
@@ -174,6 +195,9 @@ def _frame_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[
             wrists = pred.joints[side][:, 0], gt.joints[side][:, 0]
             relative = _per_frame_shape(pred_object, wrists[0], gt_object, wrists[1])
             scores[f"cd_{s}_sq"], scores[f"cd_{s}"] = relative["squared"], relative["root"]
+            scores[f"f5_{s}"], scores[f"f10_{s}"] = relative["f5"], relative["f10"]
+            offsets = [_box_centres(v) - w for v, w in zip((pred_object, gt_object), wrists, strict=True)]
+            scores[f"mrrpe_{s}"] = 1000.0 * np.linalg.norm(offsets[0] - offsets[1], axis=-1)
     if len(sides) == len(SIDES):
         for both in ("mpjpe_ra_{}", "wrist_{}", "cd_{}_sq", "cd_{}"):
             if both.format("r") in scores:
@@ -182,6 +206,10 @@ def _frame_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[
         camera = np.zeros((len(gt.frame_names), 3))
         placed = _per_frame_shape(scale * pred_object, camera, gt_object, camera)
         scores["f5_cam"], scores["f10_cam"] = placed["f5"], placed["f10"]
+        centred = _per_frame_shape(pred_object, _box_centres(pred_object), gt_object, _box_centres(gt_object))
+        scores["cd_ra_sq"], scores["f5_ra"], scores["f10_ra"] = (
+            centred[key] for key in ("squared", "f5", "f10")
+        )
     return scores
 
 
@@ -204,6 +232,7 @@ def _aligned_object_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory)
     return {
         "cd_icp_sq": fit.chamfer.squared,
         "cd_icp": fit.chamfer.root,
+        "cd_icp_arctic": min(fit.chamfer),
         "f5_icp": fit.f5,
         "f10_icp": fit.f10,
     }

@@ -222,3 +222,57 @@ def _joints(model, pose, betas):
     tips = model["tip_vertex_ids"]
     each_bone = np.einsum("jab,kjb->kja", turned, shaped[tips][:, None] - rest[None]) + posed
     return np.concatenate([posed, np.einsum("kj,kja->ka", model["weights"][tips], each_bone)])
+
+
+def test_every_score_is_that_of_the_evaluators_formulas(truth):
+    """A second writing of the definitions: loops over points, nothing shared with the code under test."""
+    rng = np.random.default_rng(9)
+    thin = dataclasses.replace(truth, object_verts=truth.object_verts[:, ::9], object_faces=None)
+    pred = dataclasses.replace(
+        thin,
+        joints={side: joints + 0.01 * rng.normal(size=joints.shape) for side, joints in truth.joints.items()},
+        object_verts=truth.object_verts[:, ::7] + 0.008 * rng.normal(size=(4, 1, 3)),
+    )
+    scores, frames = evaluate(pred, thin), per_frame(pred, thin)
+
+    def sums(p, g):
+        d1 = [100 * min(np.linalg.norm(a - b) for b in p) for a in g]
+        d2 = [100 * min(np.linalg.norm(a - b) for b in g) for a in p]
+        out = [np.mean(np.square(d1)) + np.mean(np.square(d2)), np.mean(d1) + np.mean(d2)]
+        for limit in (0.5, 1.0):
+            hit1, hit2 = np.mean(np.array(d1) < limit), np.mean(np.array(d2) < limit)
+            out.append(100 * 2 * hit1 * hit2 / (hit1 + hit2 + 1e-7))
+        return out
+
+    def centre(verts):
+        return (verts.min(axis=0) + verts.max(axis=0)) / 2
+
+    expected = {key: [] for key in frames}
+    for t in range(4):
+        both = [(side.joints, side.object_verts[t]) for side in (pred, thin)]
+        for side in ("right", "left"):
+            s = side[0]
+            (j_pred, o_pred), (j_gt, o_gt) = ((joints[side][t], verts) for joints, verts in both)
+            error = np.linalg.norm((j_pred - j_pred[0]) - (j_gt - j_gt[0]), axis=1)
+            expected[f"mpjpe_ra_{s}"].append(1000 * error.mean())
+            squared, root, f5, f10 = sums(o_pred - j_pred[0], o_gt - j_gt[0])
+            for key, value in (
+                (f"cd_{s}_sq", squared),
+                (f"cd_{s}", root),
+                (f"f5_{s}", f5),
+                (f"f10_{s}", f10),
+            ):
+                expected[key].append(value)
+            gap = (centre(o_pred) - j_pred[0]) - (centre(o_gt) - j_gt[0])
+            expected[f"mrrpe_{s}"].append(1000 * np.linalg.norm(gap))
+        squared, _, f5, f10 = sums(*(verts - centre(verts) for _, verts in both))
+        for key, value in (("cd_ra_sq", squared), ("f5_ra", f5), ("f10_ra", f10)):
+            expected[key].append(value)
+    for pair in ("mpjpe_ra_{}", "cd_{}_sq", "cd_{}"):
+        expected[pair.format("h")] = np.mean([expected[pair.format("r")], expected[pair.format("l")]], axis=0)
+    checked = [key for key, values in expected.items() if len(values)]
+    assert len(checked) == 18
+    for key in checked:
+        np.testing.assert_allclose(frames[key], expected[key], rtol=1e-9, err_msg=key)
+        assert scores[key] == pytest.approx(np.mean(expected[key])), key
+    assert scores["cd_icp_arctic"] == min(scores["cd_icp_sq"], scores["cd_icp"])

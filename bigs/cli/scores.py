@@ -1,0 +1,86 @@
+"""Commands about how good runs are: eval, and submission for others to judge them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bigs.checks import InputError
+from bigs.cli.terminal import print_table, print_tables, say, stderr, use_threads
+
+
+def evaluate(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    gt: Path | None = None,
+    clip: Path | None = None,
+    novel: Path | None = None,
+    hand_model: Path | None = None,
+    perceptual_weights: tuple[Path, ...] = (),
+    out: Path | None = None,
+    threads: int = 0,
+) -> None:
+    """Score finished runs with the field's own definitions; several stand beside the paper's tables.
+
+    Each run gets its scores in metrics.json and a row per frame in frames.csv.
+
+    Args:
+        runs: run folders.
+        gt: ground truth of one run: gt.npz or the folder that holds it, a sequence of ARCTIC's raw release
+            (ROOT/s05/box_grab_01/1), or a clip of HO-3D; the run's own clip's gt.npz if not given.
+        clip: images and masks of one run; the run's own clip if not given.
+        novel: held-back views of one run (image/, mask/, cameras.npz); its clip's folder novel if not given.
+        hand_model: MANO-format files for a data set's poses; those of the run if not given.
+        perceptual_weights: VGG-16 as torchvision publishes it, and LPIPS's channel weights, for LPIPS.
+        out: folder for comparison.md and comparison.csv, with the paper's Tables 1, 2 and 4 beside.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run, run_names
+    from bigs.commands.paper_tables import beside_paper
+
+    if not runs:
+        raise InputError("bigs eval: expected a run folder, found none")
+    for option, value in (("--gt", gt), ("--clip", clip), ("--novel", novel)):
+        if value is not None and len(runs) > 1:
+            raise InputError(f"{option}: expected one run with it, found {len(runs)}")
+    plan = EvaluationPlan(gt, clip, novel, hand_model, perceptual_weights)
+    names = run_names(runs)
+    with stderr.status("starting") as status:
+        found = {name: evaluate_run(run, plan, status.update) for name, run in zip(names, runs, strict=True)}
+    for name, evaluation in found.items():
+        for line in evaluation.missing:
+            say(f"{name}: not scored: {line}")
+    if len(runs) == 1:
+        print_table(found[names[0]].table())
+    elif out is None:
+        for table in beside_paper({name: evaluation.scores["result"] for name, evaluation in found.items()}):
+            say(f"\n{table.title}")
+            print_table(table.rows)
+            say(table.note)
+    if out is not None:
+        print_tables(compare_runs(found, out), out)
+
+
+def submission(
+    archive: Annotated[Path, tyro.conf.Positional],
+    runs: tuple[Path, ...] = (),
+    sequences: tuple[str, ...] | None = None,
+    hold_class: bool = False,
+) -> None:
+    """Pack finished runs into the ARCTIC challenge's arctic_preds.zip, or check such a zip.
+
+    Every file name, key, shape and type that the server reads is checked; it names no mistake itself.
+
+    Args:
+        archive: the zip; written if runs are given, else checked.
+        runs: run folders, one for each sequence.
+        sequences: what the server wants; the nine clips of subject 3 and camera 1 if not given.
+        hold_class: write dictionaries of HOLD's class common.xdict.xdict, for an evaluator that calls its
+            methods; plain Python then cannot open them without that class.
+    """
+    from bigs.commands.submission import submit
+
+    print_table(submit(archive, runs, sequences, hold_class=hold_class))
+    say(f"{archive} is complete")

@@ -1,0 +1,84 @@
+"""How like the truth a rendered picture is, and which of its pixels count.
+
+Published figures rarely say what they mask. Here there are two ways, both over black: `full` compares the
+render as it is with the true image blanked outside its mask, every pixel counting, so that what spills over
+the mask is an error; `foreground` blanks both, so that only what lies inside the mask is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bigs.metrics.image import psnr, ssim, ssim_map
+from bigs.metrics.report import METRICS, Metric
+
+# A distance of two batches of images [1, 3, H, W] in [0, 1], such as LPIPS.
+Distance = Callable[[Tensor, Tensor], Tensor]
+
+PICTURE_METRICS: dict[str, Metric] = {
+    "psnr_foreground": Metric("PSNR of the foreground", "dB", "higher"),
+    "psnr_full": Metric("PSNR, whole frame", "dB", "higher", detail=True),
+    "ssim_foreground": Metric("SSIM of the foreground", "", "higher"),
+    "ssim_inside": Metric("SSIM inside the mask", "", "higher", detail=True),
+    "ssim_full": Metric("SSIM, whole frame", "", "higher", detail=True),
+    "lpips_foreground": Metric("LPIPS of the foreground", "", "lower"),
+    "lpips_full": Metric("LPIPS, whole frame", "", "lower", detail=True),
+}
+# The same of views that the reconstruction never saw.
+NOVEL = "novel_"
+PICTURE_METRICS |= {
+    f"{NOVEL}{key}": Metric(f"{metric.paper}, novel views", metric.unit, metric.better, metric.detail)
+    for key, metric in PICTURE_METRICS.items()
+}
+ALL_METRICS = METRICS | PICTURE_METRICS
+
+
+def picture_scores(
+    render: np.ndarray, image: np.ndarray, mask: np.ndarray, distance: Distance | None = None
+) -> dict[str, float]:
+    """The scores of one picture; `PICTURE_METRICS` says what each key means.
+
+    PSNR takes one mean squared error over the pixels and channels that count: all, or those of the mask.
+    SSIM of the foreground is a mean over the whole blanked frames, most of which agree; `ssim_inside` is the
+    mean over the mask alone.
+
+    Args:
+        render: colours over black, [H, W, 3] in [0, 1].
+        image: the truth, [H, W, 3] in [0, 1].
+        mask: bool [H, W], what of the truth is reconstructed.
+        distance: a perceptual distance; without it there are no keys for it.
+
+    Returns:
+        Scores by key; NaN for an empty mask.
+    """
+    weights = torch.as_tensor(mask)[None]
+    pred, gt = (
+        torch.as_tensor(picture, dtype=torch.float32).permute(2, 0, 1)[None] for picture in (render, image)
+    )
+    pred, inside = pred.clamp(0.0, 1.0), weights[:, None].to(torch.float32)
+    if not bool(weights.any()):
+        return {key: float("nan") for key in _keys(distance is not None)}
+    cut, true = pred * inside, gt * inside
+    similarity = ssim_map(cut, true).mean(dim=1)
+    scores = {
+        "psnr_foreground": psnr(pred, gt, weights),
+        "psnr_full": psnr(pred, true),
+        "ssim_foreground": similarity.mean(),
+        "ssim_inside": similarity[weights].mean(),
+        "ssim_full": ssim(pred, true),
+    }
+    if distance is not None:
+        scores |= {"lpips_foreground": distance(cut, true), "lpips_full": distance(pred, true)}
+    return {key: float(value) for key, value in scores.items()}
+
+
+def _keys(with_distance: bool) -> list[str]:
+    return [
+        key
+        for key in PICTURE_METRICS
+        if not key.startswith(NOVEL) and (with_distance or not key.startswith("lpips"))
+    ]

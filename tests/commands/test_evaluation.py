@@ -1,0 +1,167 @@
+"""Scores of a finished run: from every source of truth, per frame, of held-back views, beside the paper."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import Answer, Run, assert_refused
+from PIL import Image
+from small_vgg import lpips_channels, torchvision_state
+
+from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.paper_tables import beside_paper
+from bigs.data.base import Clip
+from bigs.data.ground_truth import load_annotation
+from bigs.data.writers import write_arctic
+from bigs.metrics.picture import ALL_METRICS
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def run(tmp_path: Path, finished_run: Run) -> Path:
+    shutil.copytree(finished_run.folder, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def columns(file: Path) -> dict[str, np.ndarray]:
+    with file.open() as stream:
+        rows = list(csv.DictReader(stream))
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+
+def test_the_runs_own_clip_gives_everything(run: Path, tiny: Clip) -> None:
+    before = json.loads((run / "metrics.json").read_text())
+    found = evaluate_run(run, EvaluationPlan())
+    after = json.loads((run / "metrics.json").read_text())
+    assert after["initial"] == before["initial"] and after == found.scores
+    for key, value in before["result"].items():
+        assert after["result"][key] == pytest.approx(value, rel=1e-6), key
+    table = columns(run / "frames.csv")
+    np.testing.assert_array_equal(table["name"], tiny.frame_names)
+    assert {"mpjpe_ra_r", "cd_l_sq", "mrrpe_r", "psnr_foreground", "ssim_inside"} <= set(table)
+    for key, texts in table.items():
+        if key not in ("frame", "name"):
+            assert after["result"][key] == pytest.approx(texts.astype(float).mean(), rel=1e-4), key
+    assert found.missing == ("LPIPS: no weights (--perceptual-weights)",)
+
+
+def test_arctics_layout_is_the_same_truth(run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path) -> None:
+    annotation = load_annotation(tiny_clip)
+    images = [tiny.image(t) for t in range(len(tiny))]
+    write_arctic(
+        tmp_path / "arctic", annotation, subject="s01", sequence="bottle_grab_01", images=images, offset=0
+    )
+    own = evaluate_run(run, EvaluationPlan()).scores["result"]
+    plan = EvaluationPlan(ground_truth=tmp_path / "arctic" / "s01" / "bottle_grab_01" / "1")
+    other = evaluate_run(run, plan).scores["result"]
+    for key, value in own.items():
+        assert other[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
+
+
+def test_a_held_back_view_from_the_clips_own_camera(run: Path, tiny: Clip, tmp_path: Path) -> None:
+    times = [7, 2]
+    for part, frame in (("image", tiny.image), ("mask", tiny.mask)):
+        (tmp_path / "novel" / part).mkdir(parents=True)
+        for index, t in enumerate(times):
+            Image.fromarray(frame(t)).save(tmp_path / "novel" / part / f"{index:04d}.png")
+    arrays = {
+        "K": np.stack([tiny.K] * 2),
+        "R": np.stack([np.eye(3)] * 2),
+        "t": np.zeros((2, 3)),
+        "frame": np.array(times),
+        "wh": np.array([tiny.width, tiny.height]),
+    }
+    np.savez(tmp_path / "novel" / "cameras.npz", **arrays)
+    found = evaluate_run(run, EvaluationPlan(novel=tmp_path / "novel"))
+    for key in ("psnr_full", "psnr_foreground", "ssim_inside"):
+        assert found.scores["result"][f"novel_{key}"] == pytest.approx(
+            found.frames[key][times].mean(), rel=1e-5
+        )
+    np.savez(tmp_path / "novel" / "cameras.npz", **(arrays | {"frame": np.array([7, 12])}))
+    with pytest.raises(ValueError, match="frame: expected times from 0 to 11, found 7 to 12"):
+        evaluate_run(run, EvaluationPlan(novel=tmp_path / "novel"))
+
+
+def test_lpips_needs_both_files(run: Path, call: Callable[..., Answer], tmp_path: Path) -> None:
+    torch.save(torchvision_state(), tmp_path / "vgg.pth")
+    torch.save(lpips_channels(), tmp_path / "lin.pth")
+    refused = call("eval", run, "--perceptual-weights", tmp_path / "vgg.pth")
+    assert_refused(refused, "--perceptual-weights: expected LPIPS's channel weights", "vgg.pth")
+    answer = call("eval", run, "--perceptual-weights", tmp_path / "vgg.pth", tmp_path / "lin.pth")
+    assert answer.code == 0 and "LPIPS of the foreground" in answer.out
+    result = json.loads((run / "metrics.json").read_text())["result"]
+    assert 0 < result["lpips_foreground"] < result["lpips_full"]
+
+
+def test_runs_stand_beside_the_paper(run: Path, call: Callable[..., Answer], tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "other")
+    answer = call("eval", run, tmp_path / "other", "--out", tmp_path / "table")
+    assert answer.code == 0, answer.err
+    text = (tmp_path / "table" / "comparison.md").read_text()
+    for row in ("| run |", "| other |", "| mean of 2 |", "| paper: HOLD | 105.92 | 123.54 | 2.07 | 63.92 |"):
+        assert row in text
+    assert "Table 4" in text and "Table 2" not in text and "computes CD_r and CD_l from plain" in text
+    table = columns(tmp_path / "table" / "comparison.csv")
+    result = json.loads((run / "metrics.json").read_text())["result"]
+    np.testing.assert_array_equal(table["run"], ["run", "other"])
+    for key in ALL_METRICS:
+        if key in result:
+            assert float(table[key][1]) == pytest.approx(result[key]), key
+
+
+def test_a_run_without_left_hand_stands_beside_table_2() -> None:
+    one = {"mpjpe_ra_r": 10.0, "cd_r_sq": 2.0, "cd_icp_sq": 0.5, "f10_icp": 90.0}
+    (table,) = beside_paper({"SM1": one, "SM2": one | {"cd_r_sq": 4.0}})
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["SM1"] == ("2.00", "0.50", "90.00", "10.00") and rows["mean of 2"][0] == "3.00"
+    assert rows["paper: limited view: BIGS"] == ("21.70", "1.24", "84.02", "24.22")
+    assert rows["paper: full view: HOMan"] == ("78.20", "-", "-", "32.00")
+
+
+def test_nothing_to_score_against(run: Path, call: Callable[..., Answer], tmp_path: Path) -> None:
+    config = run / "config.yaml"
+    lines = [
+        line if not line.startswith("clip:") else f"clip: {tmp_path}/gone"
+        for line in config.read_text().splitlines()
+    ]
+    config.write_text("\n".join(lines))
+    assert_refused(call("eval", run), "expected something to score against", f"{tmp_path}/gone")
+    assert_refused(call("eval"), "expected a run folder, found none")
+    assert_refused(call("eval", run, run), "expected each run once")
+    assert_refused(call("eval", run, tmp_path, "--gt", run), "--gt: expected one run with it, found 2")
+
+
+def test_another_clip_is_refused(
+    run: Path, call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(tiny_clip, tmp_path / "clip")
+    names = (tmp_path / "clip" / "build" / "corres.txt").read_text().replace("0000", "1000")
+    (tmp_path / "clip" / "build" / "corres.txt").write_text(names)
+    answer = call("eval", run, "--clip", tmp_path / "clip")
+    assert_refused(answer, "expected the run's 12 frames from 00000.png on", "found 12 from 10000.png on")
+
+
+def test_a_submission_from_runs(run: Path, call: Callable[..., Answer], tiny: Clip, tmp_path: Path) -> None:
+    archive = tmp_path / "arctic_preds.zip"
+    answer = call("submission", archive, "--runs", run, "--sequences", tiny.name)
+    assert answer.code == 0 and "is complete" in answer.out and tiny.name in answer.out
+    assert call("submission", archive, "--sequences", tiny.name).code == 0
+    assert_refused(call("submission", archive), "expected the 9 sequences of the challenge")
+    assert_refused(
+        call("submission", archive, "--runs", tmp_path), "arctic_preds: expected the run's prediction"
+    )
+
+
+def test_a_comparison_names_what_it_shows(run: Path, tmp_path: Path) -> None:
+    found = evaluate_run(run, EvaluationPlan())
+    tables = compare_runs({"only": found}, tmp_path / "out")
+    assert [row[0] for row in tables[0].rows][:2] == ["", "only"]
+    assert not any(row[0].startswith("mean") for table in tables for row in table.rows)

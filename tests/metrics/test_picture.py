@@ -1,0 +1,74 @@
+"""Image scores by their definitions: which pixels count, and what is blanked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from bigs.metrics.picture import PICTURE_METRICS, picture_scores
+
+
+@pytest.fixture
+def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(4)
+    render, image = rng.random((24, 30, 3)), rng.random((24, 30, 3))
+    mask = np.zeros((24, 30), dtype=bool)
+    mask[5:18, 8:25] = rng.random((13, 17)) > 0.2
+    return render, image, mask
+
+
+def test_scores_are_those_of_plain_formulas(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    render, image, mask = pictures
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def distance(a: object, b: object) -> float:
+        seen.append((np.asarray(a)[0].transpose(1, 2, 0), np.asarray(b)[0].transpose(1, 2, 0)))
+        return float(len(seen))
+
+    found = picture_scores(render, image, mask, distance)
+    blanked, cut = image * mask[..., None], render * mask[..., None]
+    inside = np.mean((render - image)[mask] ** 2)
+    assert found["psnr_foreground"] == pytest.approx(-10 * np.log10(inside), abs=1e-4)
+    whole = np.mean((render - blanked) ** 2)
+    assert found["psnr_full"] == pytest.approx(-10 * np.log10(whole), abs=1e-4)
+
+    def ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        # A wide black frame stands for the zeros that the window sees outside.
+        padded = [np.pad(x, ((12, 12), (12, 12), (0, 0))) for x in (a, b)]
+        _, full = structural_similarity(
+            *padded,
+            channel_axis=2,
+            data_range=1.0,
+            gaussian_weights=True,
+            use_sample_covariance=False,
+            full=True,
+        )
+        return full[12:-12, 12:-12].mean(axis=2)
+
+    assert found["ssim_full"] == pytest.approx(ssim_map(render, blanked).mean(), abs=1e-4)
+    assert found["ssim_foreground"] == pytest.approx(ssim_map(cut, blanked).mean(), abs=1e-4)
+    assert found["ssim_inside"] == pytest.approx(ssim_map(cut, blanked)[mask].mean(), abs=1e-4)
+    assert (found["lpips_foreground"], found["lpips_full"]) == (1.0, 2.0)
+    for (pred, gt), expected in zip(seen, (cut, render), strict=True):
+        np.testing.assert_allclose(pred, expected, atol=1e-6)
+        np.testing.assert_allclose(gt, blanked, atol=1e-6)
+
+
+def test_what_lies_outside_the_mask_counts_only_in_the_whole_frame(
+    pictures: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    _, image, mask = pictures
+    spilled = np.where(mask[..., None], image, 0.5)
+    found = picture_scores(spilled, image, mask)
+    assert found["psnr_foreground"] == np.inf and found["ssim_foreground"] == pytest.approx(1.0)
+    assert found["psnr_full"] < 12 and found["ssim_full"] < 0.9
+    clean = picture_scores(np.where(mask[..., None], image, 0.0), image, mask)
+    assert clean["psnr_full"] == np.inf
+
+
+def test_an_empty_mask_has_no_score(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    render, image, mask = pictures
+    found = picture_scores(render, image, np.zeros_like(mask), lambda a, b: 0.0)
+    assert np.isnan(list(found.values())).all()
+    assert set(found) == {key for key in PICTURE_METRICS if not key.startswith("novel_")}
