@@ -51,10 +51,15 @@ def peak_of(work: Callable[[], object]) -> float:
         work()
         return 1024.0 * (_kilobytes(_STATUS, "VmHWM") - before)
     except OSError:
-        unit = 1 if platform.system() == "Darwin" else 1024
-        largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        largest = largest_so_far()
         work()
-        return float(unit * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest))
+        return largest_so_far() - largest
+
+
+def largest_so_far() -> float:
+    """Bytes that this process held at its largest."""
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return float(unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def _kilobytes(file: Path, field: str) -> int:

@@ -14,7 +14,7 @@ import tyro
 
 from bigs import __version__
 from bigs.checks import InputError
-from bigs.cli import bench, runs, scores
+from bigs.cli import bench, prior, runs, scores
 from bigs.cli.terminal import fail, say
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -29,10 +29,14 @@ COMMANDS: Commands = {
     "export": runs.export,
     "view": runs.view,
     "ablate": runs.ablate,
+    "prior": {"fit": prior.prior_fit},
     "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},
 }
 # What the help says of commands that have commands of their own.
-GROUPS = {"bench": "Measure how fast and how exact this is."}
+GROUPS = {
+    "prior": "Prepare what is known of objects in general for sides that a clip never shows.",
+    "bench": "Measure how fast and how exact this is.",
+}
 
 
 def main(arguments: list[str] | None = None) -> None:

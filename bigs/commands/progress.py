@@ -24,15 +24,7 @@ def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[
         if isinstance(stage, OptimizeStage)
     }
     total = sum(cost[stage.name] * stage.steps for stage in config.stages if isinstance(stage, OptimizeStage))
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[detail]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    progress = Progress(*columns, console=console)
+    progress = _bar(console)
     task = progress.add_task("start values", total=total, detail="")
     done = 0.0
 
@@ -61,3 +53,40 @@ def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[
     finally:
         if progress.live.is_started:
             progress.stop()
+
+
+@contextmanager
+def steps_listener(console: Console, description: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Show one bar over steps that take equal time; yields the function to pass as `listen`.
+
+    It hears "start", with "step" (done before) and what the networks weigh, and "step".
+    """
+    progress = _bar(console)
+    task = progress.add_task(description, total=None, detail="")
+
+    def listen(event: dict[str, Any]) -> None:
+        progress.start()
+        if event["event"] == "start":
+            progress.console.print(f"networks: {event['weights_gib']:.2f} GiB", highlight=False)
+            progress.reset(task, completed=event["step"])
+        elif event["event"] == "step":
+            detail = f"step {event['step']}/{event['steps']}, loss {event['loss']:.4f}"
+            progress.update(task, total=event["steps"], completed=event["step"], detail=detail)
+
+    try:
+        yield listen
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+
+
+def _bar(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+    )

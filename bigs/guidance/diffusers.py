@@ -67,7 +67,9 @@ class StableDiffusion:
         """
         self._parts = parts
         self._guidance_scale, self._conditioning_scale = guidance_scale, conditioning_scale
-        self._edges = None if parts.controlnet is None else edges
+        self._edges: EdgeDetector | None = None
+        if parts.controlnet is not None:
+            self._edges = lambda images: edges(images.to(parts.device))
         with torch.no_grad():
             word = None if token is None else add_token(parts, token)
             self._texts = encode_text(parts, view_prompts(prompts, word))
@@ -116,7 +118,7 @@ def load_stable_diffusion(config: DiffusionConfig) -> StableDiffusion:
         InputError: one sentence: which component is missing or does not fit, which file cannot be read.
     """
     token = None if config.token is None else read_token(config.token)
-    edges = soft_edges if config.edge_weights is None else load_pidinet(config.edge_weights)
+    edges = edge_detector(config.edge_weights)
     parts = load_parts(
         config.model,
         controlnet=config.controlnet,
@@ -132,6 +134,15 @@ def load_stable_diffusion(config: DiffusionConfig) -> StableDiffusion:
         conditioning_scale=config.conditioning_scale,
         edges=edges,
     )
+
+
+def edge_detector(weights: Path | None) -> EdgeDetector:
+    """PiDiNet from a file, or the built-in filter without one.
+
+    Raises:
+        InputError: the file is not PiDiNet.
+    """
+    return soft_edges if weights is None else load_pidinet(weights)
 
 
 def encode_text(parts: Parts, prompts: Sequence[str]) -> Tensor:

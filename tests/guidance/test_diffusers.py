@@ -287,7 +287,8 @@ def test_a_configuration_becomes_a_prior(
     )
     prior = load_stable_diffusion(config)
     assert prior.image_size == SIZE
-    assert prior.detect_edges is soft_edges
+    assert prior.detect_edges is not None
+    assert torch.equal(prior.detect_edges(pictures()), soft_edges(pictures()))
     images = torch.rand(1, 3, 48, 48, generator=seeded()).requires_grad_()
     sds_loss(prior, images, conditions(FRONT), SdsConfig(), progress=0.5, generator=seeded()).backward()
     assert images.grad is not None

@@ -1,0 +1,78 @@
+"""Commands for the diffusion prior: prior fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bigs.cli.terminal import say, stderr, use_threads
+
+# As `guidance.diffusers_folder` has them, spelled out because importing that takes seconds; a test compares.
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "float16", "bfloat16"]
+
+
+def prior_fit(
+    clip: Annotated[Path, tyro.conf.Positional],
+    object: str,
+    model: str,
+    out: Path,
+    controlnet: str | None = None,
+    edge_weights: Path | None = None,
+    token: str = "<bigs-object>",
+    steps: int = 1000,
+    batch: int = 2,
+    lr: float = 5e-3,
+    conditioning_scale: float = 0.8,
+    seed: int = 0,
+    device: Device = "auto",
+    precision: Precision = "auto",
+    attention_slicing: bool = False,
+    resume: bool = False,
+    threads: int = 0,
+) -> None:
+    """Teach Stable Diffusion a word for the object of a clip (textual inversion), to use with its prior.
+
+    Args:
+        clip: a clip with object masks, in any layout that bigs info reads.
+        object: what it is, in a word or two, as in "mustard bottle".
+        model: a Stable Diffusion 1.5 or 2.1 folder as diffusers saves it, or its hub name.
+        out: the .safetensors file to write; any program that reads textual inversions takes it.
+        controlnet: a soft-edge ControlNet for that model, a folder or a hub name.
+        edge_weights: PiDiNet (table5_pidinet.pth) for the ControlNet's edges; a built-in filter without it.
+        token: the new word.
+        steps: how long to learn.
+        batch: pictures in a step; memory grows with it.
+        lr: learning rate.
+        conditioning_scale: weight of the ControlNet.
+        seed: of all that is drawn.
+        device: auto takes a GPU if there is one.
+        precision: auto is float16 on a GPU and float32 on a CPU.
+        attention_slicing: less memory, more time.
+        resume: go on from where an interrupted call was.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.prior import InversionConfig, fit_token
+    from bigs.commands.progress import steps_listener
+
+    config = InversionConfig(object, token, steps, batch, lr, conditioning_scale, seed)
+    with steps_listener(stderr, f"learning {token}") as listen:
+        found = fit_token(
+            clip,
+            out,
+            config,
+            model=model,
+            controlnet=controlnet,
+            edge_weights=edge_weights,
+            device=device,
+            precision=precision,
+            attention_slicing=attention_slicing,
+            resume=resume,
+            listen=listen,
+        )
+    say(f"{found.steps} steps on {found.frames} frames, mean loss at the end {found.loss:.4f}")
+    say(f"memory: {found.peak_gib:.1f} GiB at most, {found.weights_gib:.1f} GiB of it weights")
+    say(f"the word {token} is in {found.path}")
