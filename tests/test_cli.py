@@ -25,6 +25,8 @@ from bigs.train.presets import PRESETS
         "",
         "demo",
         "info",
+        "preprocess",
+        *(f"preprocess {step}" for step in ("all", "frames", "masks", "hands", "object", "align", "build")),
         "reconstruct",
         "eval",
         "render",
@@ -46,6 +48,14 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
     text = " ".join(answer.out.replace("│", " ").split())
     expected = {
         "demo": "Make a little clip of two hands",
+        "preprocess": "from a video or images",
+        "preprocess all": "21 keypoints of each hand",
+        "preprocess frames": "Take one frame of so many",
+        "preprocess masks": "label images of right hand",
+        "preprocess hands": "What another hand estimator",
+        "preprocess object": "structure from motion",
+        "preprocess align": "one metric space",
+        "preprocess build": "that HOLD and bigs reconstruct",
         "reconstruct": "change one setting, as path=value",
         "render": "transforms.json",
         "export": "hand-meshes",

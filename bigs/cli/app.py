@@ -14,7 +14,7 @@ import tyro
 
 from bigs import __version__
 from bigs.checks import InputError
-from bigs.cli import bench, prior, runs, scores
+from bigs.cli import bench, preprocess, prior, runs, scores
 from bigs.cli.terminal import fail, say
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -22,6 +22,15 @@ Commands = Mapping[str, "Callable[..., None] | Commands"]
 COMMANDS: Commands = {
     "demo": runs.demo,
     "info": runs.info,
+    "preprocess": {
+        "all": preprocess.preprocess,
+        "frames": preprocess.frames,
+        "masks": preprocess.masks,
+        "hands": preprocess.hands,
+        "object": preprocess.object_motion,
+        "align": preprocess.align,
+        "build": preprocess.build,
+    },
     "reconstruct": runs.reconstruct,
     "eval": scores.evaluate,
     "submission": scores.submission,
@@ -34,9 +43,14 @@ COMMANDS: Commands = {
 }
 # What the help says of commands that have commands of their own.
 GROUPS = {
+    "preprocess": "Make a clip from a video or images, whole (bigs preprocess VIDEO --out CLIP) or "
+    "step by step.",
     "prior": "Prepare what is known of objects in general for sides that a clip never shows.",
     "bench": "Measure how fast and how exact this is.",
 }
+
+# Groups that may be called without naming one of their commands.
+IMPLIED = {"preprocess": "all"}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -45,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"bigs {__version__}")
         return
     try:
-        _parse(arguments)()
+        _parse(_in_full(sys.argv[1:] if arguments is None else arguments))()
     except InputError as error:
         fail(str(error), 2)
     except FloatingPointError as error:
@@ -57,7 +71,17 @@ def main(arguments: list[str] | None = None) -> None:
         fail("interrupted; --resume continues from the last checkpoint", 130)
 
 
-def _parse(arguments: list[str] | None) -> Callable[[], None]:
+def _in_full(arguments: list[str]) -> list[str]:
+    """The arguments with the command that a group stands for when none of its own follows its name."""
+    if len(arguments) < 2 or arguments[0] not in IMPLIED or arguments[1] in ("--help", "-h"):
+        return arguments
+    group, *others = arguments
+    commands = COMMANDS[group]
+    assert not callable(commands)
+    return arguments if others[0] in commands else [group, IMPLIED[group], *others]
+
+
+def _parse(arguments: list[str]) -> Callable[[], None]:
     """The command that the arguments ask for, ready to run; unknown options are refused in one line."""
 
     said = io.StringIO()

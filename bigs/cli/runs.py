@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from bigs.cli.preprocess import NO_VIDEO, VideoOptions, clip_of
 from bigs.cli.terminal import (
     Preset,
     fail_for,
@@ -85,11 +86,13 @@ def reconstruct(
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     perceptual_weights: tuple[Path, ...] = (),
     threads: int = 0,
+    video: Annotated[VideoOptions, tyro.conf.arg(name="")] = NO_VIDEO,
 ) -> None:
     """Reconstruct the hands and the object of a clip into a run folder.
 
     Args:
-        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
+        clip: a HOLD / HANDS-challenge build folder, or the folder that holds it; or a video or a folder of
+            images, which preprocessing makes a clip of first, in RUN/clip.
         out: the run folder to make.
         preset: smoke (seconds), demo, fast (two minutes), full, or paper (the paper's equations and weights).
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
@@ -102,6 +105,7 @@ def reconstruct(
         perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
             "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
         threads: CPU threads; 0 takes all.
+        video: what preprocessing needs, when the clip is a video or a folder of images.
     """
     use_threads(threads)
     from bigs.commands.progress import progress_listener
@@ -112,6 +116,7 @@ def reconstruct(
     if perceptual_weights:
         files = tuple(str(path.resolve()) for path in perceptual_weights)
         settings = dataclasses.replace(settings, perceptual_weights=files)
+    clip = clip_of(clip, out, video, hand_model)
     with progress_listener(stderr, settings) as listen:
         outcome = run(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen

@@ -18,6 +18,7 @@ from bigs.preprocess.hand_fit import HandFitConfig, fit_rays
 from bigs.preprocess.keypoints import Keypoints
 from bigs.preprocess.sides import drop_strays, sort_sides
 from bigs.preprocess.skeleton import HandPoses, HandSkeleton
+from bigs.preprocess.words import frame_ranges
 from bigs.types import Side
 
 
@@ -83,7 +84,7 @@ def fit_hands(
         poses = HandPoses(*(part[i] for part in fit.poses))
         tracks[side] = _track(side, poses, fit.betas, valid, skeleton, hand_models)
         if not valid.all():
-            notes.append(f"{side} hand: no estimate in {_ranges(~valid)}, filled from the frames around")
+            notes.append(f"{side} hand: no estimate in {frame_ranges(~valid)}, filled from the frames around")
     if not tracks:
         raise InputError("keypoints: expected a hand, found none that any pose of a hand explains")
     return HandEstimates(tracks, tuple(notes))
@@ -96,10 +97,10 @@ def _clean(
     found = sort_sides(keypoints, masks)
     notes = []
     if found.swapped.any():
-        notes.append(f"hands: sides swapped back in {_ranges(found.swapped)}")
+        notes.append(f"hands: sides swapped back in {frame_ranges(found.swapped)}")
     for side, frames in found.doubled.items():
         if frames.any():
-            notes.append(f"{side} hand: the other hand found twice in {_ranges(frames)}, dropped")
+            notes.append(f"{side} hand: the other hand found twice in {frame_ranges(frames)}, dropped")
     if masks is None:
         return found.hands, notes
     away = [
@@ -133,11 +134,3 @@ def _track(
         betas=betas.double().numpy(),
         valid=valid,
     )
-
-
-def _ranges(frames: np.ndarray) -> str:
-    """Frames [T] (bool) as text: "frames 3, 7-9"."""
-    index = np.flatnonzero(frames)
-    runs = np.split(index, np.flatnonzero(np.diff(index) > 1) + 1)
-    text = ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
-    return f"frame {text}" if len(index) == 1 else f"frames {text}"

@@ -1,0 +1,52 @@
+"""From pictures to a clip: every step makes its artefact below `CLIP/processed` unless it is up to date."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from bigs.commands.preprocess_object import align_step, object_step
+from bigs.commands.preprocess_request import STEPS, PreprocessRequest, StepName, StepOutcome
+from bigs.commands.preprocess_steps import (
+    build_step,
+    frames_step,
+    hands_step,
+    masks_step,
+)
+
+RUN: dict[StepName, Callable[[PreprocessRequest, Callable[[str], None]], StepOutcome]] = {
+    "frames": frames_step,
+    "masks": masks_step,
+    "hands": hands_step,
+    "object": object_step,
+    "align": align_step,
+    "build": build_step,
+}
+
+
+def preprocess(
+    request: PreprocessRequest,
+    steps: tuple[StepName, ...] = STEPS,
+    listen: Callable[[str], None] = lambda text: None,
+) -> list[StepOutcome]:
+    """Run steps in their order.
+
+    Args:
+        request: what the user gave.
+        steps: which; each needs the artefacts of the ones before it.
+        listen: told what is going on.
+
+    Returns:
+        What became of each step.
+
+    Raises:
+        InputError: bad input, in one sentence.
+    """
+    outcomes = []
+    for name in STEPS:
+        if name in steps:
+            listen(name)
+            began = time.perf_counter()
+            outcome = RUN[name](request, lambda text, step=name: listen(f"{step}: {text}"))  # type: ignore[misc]
+            outcomes.append(outcome._replace(seconds=time.perf_counter() - began))
+    return outcomes

@@ -1,0 +1,52 @@
+"""What a user asks of preprocessing, and what is told of each step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from bigs.preprocess.artefacts import PROCESSED, State, state_of
+from bigs.preprocess.frames import FrameConfig
+from bigs.types import Entity
+
+StepName = Literal["frames", "masks", "hands", "object", "align", "build"]
+STEPS: tuple[StepName, ...] = ("frames", "masks", "hands", "object", "align", "build")
+
+
+@dataclass(frozen=True)
+class PreprocessRequest:
+    """What the user gave. A source that is not given is looked for among the artefacts."""
+
+    clip: Path
+    source: Path | None = None  # video or folder of images
+    frames: FrameConfig = field(default_factory=FrameConfig)
+    masks: Path | None = None
+    mask_labels: Mapping[Entity, int] | None = None
+    sam2: Path | None = None  # folder of a SAM 2 video model
+    clicks: Path | None = None  # its prompts
+    keypoints: Path | None = None
+    hands: Path | None = None  # what another hand estimator wrote
+    landmarker: Path | None = None  # MediaPipe's model file
+    hand_model: Path | None = None
+    redo: bool = False
+
+    @property
+    def processed(self) -> Path:
+        return self.clip / PROCESSED
+
+    def state(self, file: Path, inputs: str) -> State:
+        """What is to be done about an artefact: nothing, or to make it."""
+        return "missing" if self.redo else state_of(file, inputs)
+
+
+class StepOutcome(NamedTuple):
+    """What became of a step."""
+
+    name: StepName
+    state: Literal["made", "up to date", "supplied"]
+    summary: str
+    notes: tuple[str, ...]
+    picture: Path | None
+    seconds: float = 0.0

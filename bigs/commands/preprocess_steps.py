@@ -1,0 +1,243 @@
+"""The steps of preprocessing that make frames, masks, hands and the build folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from bigs.checks import InputError
+from bigs.commands.preprocess_pictures import draw_clip, joints_of, tinted, with_skeletons, write_sheet
+from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
+from bigs.data.base import HandTrack
+from bigs.data.hold import load_hold
+from bigs.data.images import read_image, read_mask
+from bigs.hand import HandModel, load_hand_models
+from bigs.preprocess.artefacts import (
+    ALIGNED_FILE,
+    FRAMES_FILE,
+    HANDS_FILE,
+    MASKS,
+    MASKS_FILE,
+    SFM_FILE,
+    FrameSet,
+    content_digest,
+    frame_paths,
+    mask_paths,
+    read_alignment,
+    read_frame_set,
+    read_hands,
+    read_object_sfm,
+    write_hands,
+    write_json,
+)
+from bigs.preprocess.build import write_build
+from bigs.preprocess.frames import extract_frames, frame_inputs
+from bigs.preprocess.hand_fit import HandFitConfig
+from bigs.preprocess.hands import HandEstimates, fit_hands
+from bigs.preprocess.keypoints import read_keypoints
+from bigs.preprocess.mask_checks import check_masks
+from bigs.preprocess.masks import open_masks, write_masks
+from bigs.preprocess.source import open_source
+from bigs.preprocess.words import frame_ranges
+from bigs.types import Side
+
+BUILD_FILE = "build.json"
+Listen = Callable[[str], None]
+
+
+def frames_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
+    """Pictures of the source as `frames/` and `frames.json`."""
+    processed = request.processed
+    file = processed / FRAMES_FILE
+    picture = processed / "frames.png"
+    if request.source is None:
+        frames = read_frame_set(processed)
+        return StepOutcome("frames", "supplied", _frames_summary(frames), (), None)
+    source = open_source(request.source)
+    request.frames.check()
+    inputs = frame_inputs(source, request.frames)
+    state = request.state(file, inputs)
+    if state in ("current", "supplied"):
+        frames = read_frame_set(processed)
+        frame_paths(processed, frames)
+        return _kept("frames", state, _frames_summary(frames), picture)
+    frames = extract_frames(source, processed, request.frames, inputs, listen)
+    write_sheet(picture, frame_paths(processed, frames), frames.names, lambda t, image: image)
+    notes = (
+        () if frames.focal_known else (f"camera {frames.camera}: give --K, --focal or --colmap if you can",)
+    )
+    return StepOutcome("frames", "made", _frames_summary(frames), notes, picture)
+
+
+def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
+    """Label images as `masks/` and what looks wrong in them as `masks.json`."""
+    processed = request.processed
+    frames = read_frame_set(processed)
+    file, picture = processed / MASKS_FILE, processed / "masks.png"
+    given = request.masks
+    if given is None and not file.exists() and (processed / MASKS).is_dir():
+        return _adopt_masks(processed, frames, picture)
+    if given is None:
+        if not file.exists():
+            raise InputError(
+                f"{processed / MASKS}: expected masks of hands and object, found none; give --masks DIR, "
+                "or --sam2 DIR with --clicks FILE"
+            )
+        mask_paths(processed, frames)
+        return StepOutcome("masks", "supplied", "as they are", _stored_notes(file), None)
+    if not given.is_dir():
+        raise InputError(
+            f"{given}: expected a folder of masks, found {'a file' if given.exists() else 'nothing'}"
+        )
+    inputs = content_digest(given, request.mask_labels, _frame_identity(frames))
+    state = request.state(file, inputs)
+    if state in ("current", "supplied"):
+        mask_paths(processed, frames)
+        return _kept("masks", state, "as they are", picture, _stored_notes(file))
+    source = open_masks(given, frames, request.mask_labels)
+    found: list[str] = []
+
+    def check(masks: list[np.ndarray], twice: list[int]) -> list[str]:
+        found.extend(check_masks(masks, twice, frames.names))
+        return found
+
+    masks = write_masks(processed, frames, source.label, inputs, check)
+    _draw_masks(picture, processed, frames, masks)
+    return StepOutcome("masks", "made", f"from {source.layout}", tuple(found), picture)
+
+
+def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
+    """`hands.npz` from keypoints."""
+    processed = request.processed
+    frames = read_frame_set(processed)
+    file, picture = processed / HANDS_FILE, processed / "hands.png"
+    if request.keypoints is None:
+        if not file.exists():
+            raise InputError(
+                f"{file}: expected estimates of the hands, found none; give --keypoints FILE (21 points "
+                f"of each "
+                "hand), or --hands FILE of another hand estimator"
+            )
+        hands = read_hands(file, len(frames.names))
+        return StepOutcome("hands", "supplied", _hands_summary(hands), (), None)
+    config = HandFitConfig()
+    masks = processed / MASKS
+    inputs = content_digest(
+        request.keypoints, _frame_identity(frames), frames.K, masks, _model_identity(request), asdict(config)
+    )
+    state = request.state(file, inputs)
+    if state in ("current", "supplied"):
+        return _kept("hands", state, _hands_summary(read_hands(file, len(frames.names))), picture)
+    models = load_hand_models(request.hand_model)
+    keypoints = read_keypoints(request.keypoints, frames)
+    labels = None
+    if (processed / MASKS_FILE).exists():
+        labels = [read_mask(path) for path in mask_paths(processed, frames)]
+    listen("fitting")
+    found = fit_hands(keypoints, frames.K, models, fps=frames.fps, masks=labels, config=config)
+    write_hands(file, found.tracks, inputs)
+    _draw_hands(picture, processed, frames, found, models)
+    return StepOutcome("hands", "made", _hands_summary(found.tracks), found.notes, picture)
+
+
+def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
+    """`CLIP/build` from all artefacts."""
+    processed = request.processed
+    frames = read_frame_set(processed)
+    count = len(frames.names)
+    stamp, picture = processed / BUILD_FILE, processed / "build.png"
+    parts = [processed / name for name in (FRAMES_FILE, MASKS, HANDS_FILE, SFM_FILE, ALIGNED_FILE)]
+    inputs = content_digest(*parts, frames.K, _model_identity(request))
+    ours = stamp.exists()
+    if request.state(stamp, inputs) == "current" and (request.clip / "build" / "data.npy").is_file():
+        return _kept("build", "current", str(request.clip / "build"), picture)
+    models = load_hand_models(request.hand_model)
+    images, masks = frame_paths(processed, frames), mask_paths(processed, frames)
+    build = write_build(
+        request.clip,
+        name=request.clip.resolve().name,
+        frame_names=frames.names,
+        images=(read_image(path) for path in images),
+        masks=(read_mask(path) for path in masks),
+        K=frames.K,
+        hands=read_hands(processed / HANDS_FILE, count),
+        hand_models=models,
+        sfm=read_object_sfm(processed / SFM_FILE, count),
+        alignment=read_alignment(processed / ALIGNED_FILE, count),
+        ours=ours,
+    )
+    clip = load_hold(build)
+    write_json(stamp, {"build": str(build)}, inputs)
+    write_sheet(picture, images, frames.names, draw_clip(clip, models))
+    return StepOutcome("build", "made", str(build), (), picture)
+
+
+def _adopt_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:
+    """Masks that another tool put in their place: looked at, and kept as they are."""
+    masks = [read_mask(path, (frames.width, frames.height)) for path in mask_paths(processed, frames)]
+    notes = tuple(check_masks(masks, [0] * len(masks), frames.names))
+    write_json(processed / MASKS_FILE, {"notes": notes}, "")
+    _draw_masks(picture, processed, frames, masks)
+    return StepOutcome("masks", "supplied", "as they are", notes, picture)
+
+
+def _kept(name: str, state: str, summary: str, picture: Path, notes: tuple[str, ...] = ()) -> StepOutcome:
+    """A step that has nothing to do."""
+    if state == "supplied":
+        notes = (*notes, "kept as another tool supplied it; remove it, or pass --redo, to have it made")
+    shown = picture if picture.exists() else None
+    return StepOutcome(name, "supplied" if state == "supplied" else "up to date", summary, notes, shown)  # type: ignore[arg-type]
+
+
+def _frame_identity(frames: FrameSet) -> dict[str, object]:
+    """What of the frames decides which mask or keypoint belongs to which frame, and at what size."""
+    return {
+        key: value
+        for key, value in asdict(frames).items()
+        if key in ("names", "width", "height", "fps", "source_frames", "source_length", "source_size")
+    }
+
+
+def _model_identity(request: PreprocessRequest) -> Path | str:
+    return "built-in" if request.hand_model is None else request.hand_model
+
+
+def _stored_notes(file: Path) -> tuple[str, ...]:
+    return tuple(str(note) for note in json.loads(file.read_text(encoding="utf-8")).get("notes", ()))
+
+
+def _frames_summary(frames: FrameSet) -> str:
+    text = f"{len(frames.names)} of {frames.width} x {frames.height} at {frames.fps:.3g} a second"
+    return f"{text}, focal length {frames.K[0, 0]:.0f} pixels ({frames.camera})"
+
+
+def _hands_summary(hands: dict[Side, HandTrack]) -> str:
+    parts = []
+    for side, track in hands.items():
+        text = f"{side} in {int(track.valid.sum())} of {len(track.valid)} frames"
+        if not track.valid.all():
+            text += f" (filled in {frame_ranges(~track.valid)})"
+        parts.append(text)
+    return ", ".join(parts)
+
+
+def _draw_masks(picture: Path, processed: Path, frames: FrameSet, masks: list[np.ndarray]) -> None:
+    write_sheet(
+        picture, frame_paths(processed, frames), frames.names, lambda t, image: tinted(image, masks[t])
+    )
+
+
+def _draw_hands(
+    picture: Path, processed: Path, frames: FrameSet, found: HandEstimates, models: dict[Side, HandModel]
+) -> None:
+    joints = {side: joints_of(track, models[side]) for side, track in found.tracks.items()}
+
+    def draw(t: int, image: np.ndarray) -> np.ndarray:
+        valid = {side: bool(track.valid[t]) for side, track in found.tracks.items()}
+        return with_skeletons(image, {side: points[t] for side, points in joints.items()}, valid, frames.K)
+
+    write_sheet(picture, frame_paths(processed, frames), frames.names, draw)

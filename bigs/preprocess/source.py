@@ -1,0 +1,132 @@
+"""Pictures one after the other, upright: from a video file or from a folder of images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image, ImageOps
+
+from bigs.checks import InputError
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+# Folders of images say nothing of time.
+FOLDER_FPS = 30.0
+# What Pillow raises for files that are not images, are cut short, or unpack to an absurd size.
+_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where pictures come from, before any is decoded."""
+
+    path: Path
+    fps: float
+    exif: Mapping[int, object] = field(default_factory=dict)  # of the first image
+    tags: Mapping[str, str] = field(default_factory=dict)  # of the video
+    images: tuple[Path, ...] = ()  # of a folder
+
+    def pictures(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Name and pixels [H, W, 3] uint8 RGB of every picture, upright, in order.
+
+        Raises:
+            InputError: a picture cannot be decoded.
+        """
+        return self._folder_pictures() if self.images else self._video_pictures()
+
+    def _folder_pictures(self) -> Iterator[tuple[str, np.ndarray]]:
+        for path in self.images:
+            try:
+                with Image.open(path) as image:
+                    yield path.name, np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            except _UNREADABLE as error:
+                raise InputError(
+                    f"{path}: expected a readable image, found a damaged one ({error})"
+                ) from None
+
+    def _video_pictures(self) -> Iterator[tuple[str, np.ndarray]]:
+        av = _import_av(self.path)
+        index = 0
+        try:
+            with av.open(str(self.path)) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                for frame in container.decode(stream):
+                    pixels = frame.to_ndarray(format="rgb24")
+                    # The flag says how far to turn the picture counter-clockwise to set it upright.
+                    yield (
+                        f"{index:06d}.png",
+                        np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90))),
+                    )
+                    index += 1
+        except av.FFmpegError as error:
+            raise InputError(
+                f"{self.path}: expected a readable video, found {error.strerror or error} after frame {index}"
+            ) from None
+
+
+def open_source(path: Path) -> Source:
+    """Look at a video file or a folder of images.
+
+    Raises:
+        InputError: neither; or a video that cannot be opened, or the extra for videos is not installed.
+    """
+    if path.is_dir():
+        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
+        if not files:
+            raise InputError(
+                f"{path}: expected images ({', '.join(PICTURE_SUFFIXES)}), found none in this folder"
+            )
+        images = tuple(sorted(files, key=natural_order))
+        return Source(path, FOLDER_FPS, exif=_exif(images[0]), images=images)
+    if not path.is_file():
+        raise InputError(f"{path}: expected a video file or a folder of images, found nothing")
+    av = _import_av(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: expected a video, found a file without pictures")
+            stream = container.streams.video[0]
+            rate = stream.average_rate or stream.guessed_rate
+            return Source(path, float(rate) if rate else FOLDER_FPS, tags=dict(container.metadata))
+    except av.FFmpegError as error:
+        raise InputError(f"{path}: expected a readable video, found {error.strerror or error}") from None
+
+
+def is_source(path: Path) -> bool:
+    """Whether a path looks like something to preprocess rather than like a finished clip."""
+    if path.is_dir():
+        finished = any((place / "data.npy").exists() for place in (path, path / "build"))
+        return not finished and any(f.suffix.lower() in PICTURE_SUFFIXES for f in path.iterdir())
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def _import_av(path: Path):  # type: ignore[no-untyped-def]  # PyAV's stubs are not asked for
+    try:
+        import av
+    except ImportError:
+        raise InputError(
+            f"{path}: expected the extra 'video' (pip install 'bigs[video]') or a folder of images, "
+            "found no PyAV"
+        ) from None
+    return av
+
+
+def _exif(path: Path) -> dict[int, object]:
+    """EXIF entries by number, those about the exposure among them."""
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: expected a readable image, found a damaged one ({error})") from None
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """A key that sorts frame2 before frame10."""
+    parts = re.findall(r"\d+|\D+", path.name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
