@@ -14,7 +14,7 @@ import tyro
 
 from bigs import __version__
 from bigs.checks import InputError
-from bigs.cli import bench, preprocess, prior, runs, scores
+from bigs.cli import bench, clips, preprocess, prior, runs, scores
 from bigs.cli.terminal import fail, say
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -31,6 +31,7 @@ COMMANDS: Commands = {
         "align": preprocess.align,
         "build": preprocess.build,
     },
+    "convert": clips.convert,
     "reconstruct": runs.reconstruct,
     "eval": scores.evaluate,
     "submission": scores.submission,

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from bigs.atomic import atomic_write
 from bigs.bench.page import Table, page
@@ -18,7 +17,8 @@ from bigs.checks import InputError
 from bigs.commands.clips import open_clip
 from bigs.commands.paper_tables import beside_paper, mean_scores
 from bigs.commands.pictures import frame_scores, means, novel_scores
-from bigs.commands.run_folder import CONFIG, METRICS, load_run, write_json
+from bigs.commands.run_clip import hand_models_of_run, origin_of
+from bigs.commands.run_folder import METRICS, load_run, write_json
 from bigs.commands.truth import find_ground_truth, load_truth
 from bigs.data.base import Clip
 from bigs.data.novel import CAMERAS
@@ -80,9 +80,8 @@ def evaluate_run(
             there is nothing to score against.
     """
     playback = load_run(run)
-    origin = yaml.safe_load((run / CONFIG).read_text()) if (run / CONFIG).is_file() else {}
-    hand_file = plan.hand_model or (Path(origin["hand_model"]) if origin.get("hand_model") else None)
-    hand_models = load_hand_models(hand_file)
+    origin = origin_of(run)
+    hand_models = load_hand_models(plan.hand_model) if plan.hand_model else hand_models_of_run(run)
     clip_path = plan.clip or (Path(origin["clip"]) if origin.get("clip") else None)
     distance = _perceptual(plan.perceptual_weights)
     clip = _open_frames(clip_path, hand_models, playback, given=plan.clip is not None)

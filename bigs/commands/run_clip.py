@@ -31,7 +31,7 @@ def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | Non
             raise InputError(f"{given}: expected the {frames} frames of {run}, found {len(clip)}")
         return clip
     try:
-        clip = open_clip(Path(_origin(run)["clip"]), load_hand_models(None))
+        clip = open_clip(Path(origin_of(run)["clip"]), load_hand_models(None))
     except (InputError, KeyError, TypeError):
         return None
     return clip if len(clip) == frames else None
@@ -43,12 +43,12 @@ def hand_models_of_run(run: Path) -> Mapping[Side, HandModel]:
     Raises:
         InputError: the models' files are there and not as they should be.
     """
-    stored = _origin(run).get("hand_model")
+    stored = origin_of(run).get("hand_model")
     return load_hand_models(Path(stored) if stored and Path(stored).exists() else None)
 
 
-def _origin(run: Path) -> Mapping[str, Any]:
-    """What config.yaml says; nothing when it cannot be read."""
+def origin_of(run: Path) -> Mapping[str, Any]:
+    """What the run's config.yaml says; nothing when it cannot be read."""
     try:
         found = yaml.safe_load((run / CONFIG).read_text())
     except (OSError, yaml.YAMLError):

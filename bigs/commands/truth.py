@@ -37,13 +37,23 @@ def load_truth(
     """
     if path.suffix == ".npz" or (path / "gt.npz").is_file():
         return load_ground_truth(path)
+    return pose_annotation(read_annotation(path, frame_names, hand_models), hand_models)
+
+
+def read_annotation(
+    path: Path, frame_names: Sequence[str], hand_models: Mapping[Side, HandModel]
+) -> Annotation:
+    """A data set's annotation of some frames, by their own names.
+
+    Raises:
+        InputError: no data set there, or it is not as it should be.
+    """
     clip = find_ho3d(path) if path.is_dir() else None
     if clip is not None:
-        mean = hand_models["right"].hands_mean.double().numpy()
-        return pose_annotation(read_ho3d(clip, frame_names, mean), hand_models)
+        return read_ho3d(clip, frame_names, hand_models["right"].hands_mean.double().numpy())
     sequence = find_arctic(path)
     if sequence is not None:
-        return pose_annotation(read_arctic(sequence, frame_names), hand_models)
+        return read_arctic(sequence, frame_names)
     raise InputError(
         f"{path}: expected gt.npz, a folder that holds it, an ARCTIC raw sequence or an HO-3D clip, found "
         f"{'another folder' if path.is_dir() else 'nothing'}"

@@ -1,0 +1,42 @@
+"""Commands about clips before they are reconstructed: convert."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bigs.cli.terminal import say
+
+
+def convert(
+    clip: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    view: Literal["full", "limited"] = "full",
+    every: int = 1,
+    width: int = 0,
+    masks: Path | None = None,
+    from_truth: bool = False,
+    hand_model: Path | None = None,
+) -> None:
+    """Write a clip of any layout, or some of its frames, as a HOLD / HANDS-challenge build folder.
+
+    A data set's truth becomes gt.npz beside it.
+
+    Args:
+        clip: the clip, see bigs info.
+        out: folder to make.
+        view: full, or the paper's limited view: a quarter of the frames, which see the object from few sides.
+        every: keep every so many-th frame.
+        width: of the images; 0 keeps theirs.
+        masks: folder of label masks (0, 50 object, 150 right, 250 left) named as the images; the clip's own
+            if not given.
+        from_truth: start from a data set's ground truth. No fair start: for studies of what follows it.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+    """
+    from bigs.commands.convert import ConvertPlan
+    from bigs.commands.convert import convert as run
+
+    for name, text in run(clip, out, ConvertPlan(view, every, width, masks, from_truth), hand_model):
+        say(f"{name:10s} {text}")
