@@ -1,0 +1,251 @@
+"""Bundle adjustment of one moving object under a prior for smooth motion.
+
+The camera is still and known; unknown are the object's pose in every frame and its points. What is minimised
+is a sum of Cauchy losses of reprojection errors and of each frame's second differences of pose, so that a
+frame with few observations goes where its neighbours' motion leads. Gauss-Newton with Levenberg's damping;
+the points are eliminated by a Schur complement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class BundleConfig:
+    """Scales of the Cauchy losses, and when to stop."""
+
+    pixel_sigma: float = 0.4  # of a reprojection error, pixels
+    turn_sigma: float = 0.6  # of the change of angular velocity, degrees a frame and frame
+    shift_sigma: float = 0.003  # of the change of velocity, in depths a frame and frame
+    iterations: int = 15
+    # Stop when a step lowers the cost by less than this share of it.
+    tolerance: float = 1e-4
+
+
+class Bundle(NamedTuple):
+    """Poses of consecutive frames, points, and what was seen where."""
+
+    rotations: np.ndarray  # [T, 3, 3] object to camera
+    transl: np.ndarray  # [T, 3]
+    points: np.ndarray  # [N, 3]
+    frame: np.ndarray  # [M] frame of each observation
+    point: np.ndarray  # [M] point of each observation
+    pixels: np.ndarray  # [M, 2]
+
+    def residuals(self, K: np.ndarray) -> np.ndarray:
+        """Reprojection errors [M, 2] in pixels; huge where a point is behind the camera."""
+        return _project(_in_camera(self), K) - self.pixels
+
+    def depths(self) -> np.ndarray:
+        """Depth [M] of every observed point in its frame."""
+        return _in_camera(self)[:, 2]
+
+
+def adjust(
+    bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndarray | None = None
+) -> Bundle:
+    """Minimise reprojection errors under the motion prior.
+
+    Args:
+        bundle: start values. A frame without observations is placed by the prior alone.
+        K: [3, 3] intrinsics.
+        config: see there.
+        free: [T] bool, frames whose pose may change; all by default.
+
+    Returns:
+        The adjusted bundle; its gauge (pose and size of the object frame) is free to drift a little.
+    """
+    free = np.ones(len(bundle.rotations), dtype=bool) if free is None else free
+    damping = 1e-3
+    cost = _cost(bundle, K, config)
+    for _ in range(config.iterations):
+        system = _linearise(bundle, K, config, free)
+        for _ in range(6):
+            candidate = _step(bundle, system, free, damping)
+            new_cost = _cost(candidate, K, config)
+            if new_cost < cost:
+                break
+            damping *= 8.0
+        else:
+            return bundle
+        gain, cost, bundle, damping = cost - new_cost, new_cost, candidate, max(damping / 6.0, 1e-7)
+        if gain < config.tolerance * cost:
+            break
+    return bundle
+
+
+class _System(NamedTuple):
+    """Normal equations: poses [6F], points [3N], and their coupling."""
+
+    poses: np.ndarray  # [6F, 6F]
+    points: np.ndarray  # [N, 3, 3]
+    coupling: scipy.sparse.bsr_matrix  # [6F, 3N]
+    pose_gradient: np.ndarray  # [6F]
+    point_gradient: np.ndarray  # [N, 3]
+
+
+def _in_camera(bundle: Bundle) -> np.ndarray:
+    points = bundle.points[bundle.point]
+    return np.einsum("mij,mj->mi", bundle.rotations[bundle.frame], points) + bundle.transl[bundle.frame]
+
+
+def _project(cam: np.ndarray, K: np.ndarray) -> np.ndarray:
+    depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
+    return cam[:, :2] / depth[:, None] * (K[0, 0], K[1, 1]) + K[:2, 2]
+
+
+def _cauchy(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Loss and weight of squared norms in units of their scale."""
+    return np.log1p(squared), 1.0 / (1.0 + squared)
+
+
+def _soft(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same for a loss that grows like the norm itself: a real change of motion costs, but is not free."""
+    root = np.sqrt(1.0 + squared)
+    return 2.0 * (root - 1.0), 1.0 / root
+
+
+def _cost(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> float:
+    pixel, _ = _cauchy((bundle.residuals(K) ** 2).sum(1) / config.pixel_sigma**2)
+    turn, shift = _accelerations(bundle, config)
+    return float(
+        pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
+    )
+
+
+def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Second differences of rotation and position [T - 2, 3], in units of their scales."""
+    steps = bundle.rotations[1:] @ bundle.rotations[:-1].transpose(0, 2, 1)
+    velocity = Rotation.from_matrix(steps).as_rotvec()
+    depth = float(np.median(bundle.transl[:, 2]))
+    return (
+        np.diff(velocity, axis=0) / np.radians(config.turn_sigma),
+        np.diff(bundle.transl, 2, axis=0) / (config.shift_sigma * depth),
+    )
+
+
+def _linearise(bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray) -> _System:
+    """Normal equations about `bundle`; a pose changes by a turn about the object's origin, and a shift."""
+    cam = _in_camera(bundle)
+    spoke = cam - bundle.transl[bundle.frame]
+    depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
+    zero = np.zeros(len(cam))
+    by_cam = np.stack(
+        [
+            np.stack([K[0, 0] / depth, zero, -K[0, 0] * cam[:, 0] / depth**2], axis=1),
+            np.stack([zero, K[1, 1] / depth, -K[1, 1] * cam[:, 1] / depth**2], axis=1),
+        ],
+        axis=1,
+    )
+    by_turn = -np.einsum("mij,mjk->mik", by_cam, _cross_matrix(spoke))
+    by_pose = np.concatenate([by_turn, by_cam], axis=2)
+    by_point = np.einsum("mij,mjk->mik", by_cam, bundle.rotations[bundle.frame])
+    residual = bundle.residuals(K)
+    weight = _cauchy((residual**2).sum(1) / config.pixel_sigma**2)[1] / config.pixel_sigma**2
+
+    count, frames = len(bundle.points), int(free.sum())
+    weighted_point = weight[:, None, None] * by_point
+    points = _sum_by(bundle.point, np.einsum("mij,mik->mjk", weighted_point, by_point), count)
+    point_gradient = _sum_by(bundle.point, np.einsum("mij,mi->mj", weighted_point, residual), count)
+
+    poses = np.zeros((frames, 6, frames, 6))
+    pose_gradient = np.zeros((frames, 6))
+    slot = np.cumsum(free) - 1
+    moving = np.flatnonzero(free[bundle.frame])
+    row = slot[bundle.frame[moving]]
+    weighted_pose = weight[moving, None, None] * by_pose[moving]
+    diagonal = np.arange(frames)
+    poses[diagonal, :, diagonal, :] = _sum_by(
+        row, np.einsum("mij,mik->mjk", weighted_pose, by_pose[moving]), frames
+    )
+    pose_gradient += _sum_by(row, np.einsum("mij,mi->mj", weighted_pose, residual[moving]), frames)
+    order = np.lexsort((bundle.point[moving], row))
+    blocks = np.einsum("mij,mik->mjk", weighted_pose, by_point[moving])[order]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=frames))])
+    coupling = scipy.sparse.bsr_matrix(
+        (blocks, bundle.point[moving][order], starts), shape=(6 * frames, 3 * count), blocksize=(6, 3)
+    )
+    _add_prior(poses, pose_gradient, bundle, config, free, slot)
+    return _System(
+        poses.reshape(6 * frames, 6 * frames), points, coupling, pose_gradient.ravel(), point_gradient
+    )
+
+
+def _add_prior(
+    poses: np.ndarray,
+    gradient: np.ndarray,
+    bundle: Bundle,
+    config: BundleConfig,
+    free: np.ndarray,
+    slot: np.ndarray,
+) -> None:
+    """Add the prior's part in place. Steps are small, so turns are differenced as if they commuted."""
+    depth = float(np.median(bundle.transl[:, 2]))
+    scales = (1.0 / np.radians(config.turn_sigma), 1.0 / (config.shift_sigma * depth))
+    for part, (values, scale) in enumerate(zip(_accelerations(bundle, config), scales, strict=True)):
+        weights = _soft((values**2).sum(1))[1]
+        columns = slice(3 * part, 3 * part + 3)
+        for middle, (value, weight) in enumerate(zip(values, weights, strict=True), start=1):
+            for i, a in enumerate((middle - 1, middle, middle + 1)):
+                if not free[a]:
+                    continue
+                gradient[slot[a], columns] += weight * _SECOND[i] * scale * value
+                for j, b in enumerate((middle - 1, middle, middle + 1)):
+                    if free[b]:
+                        block = poses[slot[a], columns, slot[b], columns]
+                        block[np.arange(3), np.arange(3)] += weight * _SECOND[i] * _SECOND[j] * scale**2
+
+
+# Coefficients of a second difference.
+_SECOND = (1.0, -2.0, 1.0)
+
+
+def _step(bundle: Bundle, system: _System, free: np.ndarray, damping: float) -> Bundle:
+    """One damped Gauss-Newton step."""
+    index = np.arange(3)
+    points = system.points.copy()
+    points[:, index, index] *= 1.0 + damping
+    points[:, index, index] += 1e-9 * (1.0 + np.trace(points, axis1=1, axis2=2))[:, None]
+    inverse = np.linalg.inv(points)
+    frames = int(free.sum())
+    poses = system.poses.copy()
+    poses[np.diag_indices_from(poses)] *= 1.0 + damping
+    poses[np.diag_indices_from(poses)] += 1e-9
+    coupling = system.coupling
+    scaled = scipy.sparse.bsr_matrix(
+        (coupling.data @ inverse[coupling.indices], coupling.indices, coupling.indptr),
+        shape=coupling.shape,
+        blocksize=(6, 3),
+    )
+    reduced = poses - (scaled @ coupling.T).toarray()
+    right = scaled @ system.point_gradient.ravel() - system.pose_gradient
+    change = scipy.linalg.solve(reduced, right, assume_a="sym")
+    pull = (coupling.T @ change).reshape(-1, 3) + system.point_gradient
+    moved = -np.einsum("nij,nj->ni", inverse, pull)
+    change = change.reshape(frames, 6)
+    rotations, transl = bundle.rotations.copy(), bundle.transl.copy()
+    rotations[free] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotations[free]
+    transl[free] += change[:, 3:]
+    return bundle._replace(rotations=rotations, transl=transl, points=bundle.points + moved)
+
+
+def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
+    """[M, 3, 3] matrices of the cross product with `vectors` [M, 3] on the left."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Sums [count, ...] of the rows of `values` [M, ...] that have the same `index` [M]."""
+    matrix = scipy.sparse.csr_matrix(
+        (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
+    )
+    return (matrix @ values.reshape(len(index), -1)).reshape(count, *values.shape[1:])

@@ -1,0 +1,222 @@
+"""Incremental structure from motion on one object's features, and robust bundle adjustment of each model."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from bigs.preprocess.sfm_features import FrameFeatures
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """Matching and incremental mapping; lengths in pixels are of the clip's images."""
+
+    # Each frame is matched with this many later ones; far pairs invite look-alike sides to be taken for one.
+    overlap: int = 10
+    # How far a match may lie from its epipolar line, and a point from its pixel while a frame is added.
+    match_error: float = 1.5
+    pose_error: float = 3.0
+    point_error: float = 1.5
+    # Smallest angle between the first pair's rays, degrees.
+    init_angle: float = 16.0
+    min_model_size: int = 5
+    # Robust bundle adjustment: rounds, scale of the Cauchy loss, and what is dropped between rounds.
+    rounds: int = 3
+    loss_scale: float = 0.5
+    keep_error: float = 1.5
+    keep_angle: float = 1.5
+    seed: int = 0
+
+
+class PartialModel(NamedTuple):
+    """One model: some frames' poses, points, and what was seen where. Units are the model's own."""
+
+    frames: np.ndarray  # [F] frame numbers, ascending
+    rotations: np.ndarray  # [F, 3, 3] object to camera
+    transl: np.ndarray  # [F, 3]
+    points: np.ndarray  # [N, 3] object frame
+    seen_frame: np.ndarray  # [M] frame number of each observation
+    seen_feature: np.ndarray  # [M] which of that frame's features it is
+    seen_point: np.ndarray  # [M] which point it shows
+
+
+class Mapping(NamedTuple):
+    """What structure from motion found, and how much it had to go on."""
+
+    models: list[PartialModel]  # largest first
+    matches: dict[tuple[int, int], np.ndarray]  # (earlier, later frame): [n, 2] verified pairs of features
+    focal: float  # pixels, as estimated or given
+
+
+def map_features(
+    features: Sequence[FrameFeatures],
+    K: np.ndarray,
+    size: tuple[int, int],
+    known_focal: bool,
+    config: MappingConfig,
+) -> Mapping:
+    """Match neighbouring frames and build models from them.
+
+    Args:
+        features: of T frames.
+        K: [3, 3] intrinsics.
+        size: width and height of the images.
+        known_focal: whether the focal length in `K` is to be believed or is only a first guess.
+        config: see there.
+    """
+    with tempfile.TemporaryDirectory(prefix="bigs-sfm-") as folder:
+        file = Path(folder) / "clip.db"
+        _write_database(file, features, K, size, known_focal)
+        _match(file, config)
+        matches = _verified_matches(file)
+        (Path(folder) / "models").mkdir()
+        found = pycolmap.incremental_mapping(
+            file, folder, Path(folder) / "models", _pipeline_options(known_focal, config)
+        )
+        models, focals = [], []
+        for reconstruction in found.values():
+            _refine(reconstruction, known_focal, config)
+            model = _read_model(reconstruction)
+            if len(model.frames) >= config.min_model_size and len(model.points):
+                models.append(model)
+                focals.append(reconstruction.cameras[1].mean_focal_length())
+    order = sorted(range(len(models)), key=lambda i: -len(models[i].seen_point))
+    focal = focals[order[0]] if order else float(K[0, 0])
+    return Mapping([models[i] for i in order], matches, focal)
+
+
+def _write_database(
+    file: Path,
+    features: Sequence[FrameFeatures],
+    K: np.ndarray,
+    size: tuple[int, int],
+    known_focal: bool,
+) -> None:
+    camera = pycolmap.Camera(
+        model="PINHOLE",
+        width=size[0],
+        height=size[1],
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        camera_id=1,
+    )
+    camera.has_prior_focal_length = known_focal
+    with pycolmap.Database.open(file) as database:
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        for t, frame in enumerate(features):
+            image = pycolmap.Image(name=f"{t:06d}.png", camera_id=1, image_id=t + 1)
+            database.write_image(image, use_image_id=True)
+            entry = pycolmap.Frame(frame_id=t + 1, rig_id=1)
+            entry.add_data_id(image.data_id)
+            database.write_frame(entry, use_frame_id=True)
+            if len(frame.pixels):
+                database.write_keypoints(t + 1, frame.pixels.astype(np.float32))
+                database.write_descriptors(
+                    t + 1,
+                    pycolmap.FeatureDescriptors(
+                        data=frame.descriptors, type=pycolmap.FeatureExtractorType.SIFT
+                    ),
+                )
+
+
+def _match(file: Path, config: MappingConfig) -> None:
+    pairing = pycolmap.SequentialPairingOptions(
+        overlap=config.overlap, quadratic_overlap=False, loop_detection=False
+    )
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.max_error = config.match_error
+    verification.ransac.random_seed = config.seed
+    pycolmap.match_sequential(
+        file,
+        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _verified_matches(file: Path) -> dict[tuple[int, int], np.ndarray]:
+    with pycolmap.Database.open(file) as database:
+        pairs, geometries = database.read_two_view_geometries()
+    matches = {}
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        if len(geometry.inlier_matches):
+            matches[first - 1, second - 1] = np.asarray(geometry.inlier_matches, dtype=int)
+    return matches
+
+
+def _pipeline_options(known_focal: bool, config: MappingConfig) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=config.min_model_size,
+        extract_colors=False,
+        random_seed=config.seed,
+        ba_refine_focal_length=not known_focal,
+        ba_refine_principal_point=False,
+        ba_refine_extra_params=False,
+    )
+    mapper = options.mapper
+    mapper.init_min_tri_angle = config.init_angle
+    mapper.init_max_error = config.match_error
+    mapper.abs_pose_max_error = config.pose_error
+    mapper.abs_pose_refine_focal_length = not known_focal
+    mapper.filter_max_reproj_error = config.point_error
+    options.triangulation.merge_max_reproj_error = config.point_error
+    options.triangulation.complete_max_reproj_error = config.point_error
+    return options
+
+
+def _refine(reconstruction: pycolmap.Reconstruction, known_focal: bool, config: MappingConfig) -> None:
+    """Robust bundle adjustment; what fits badly or hangs on a thin angle is dropped between the rounds."""
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=not known_focal,
+        refine_principal_point=False,
+        refine_extra_params=False,
+        print_summary=False,
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = config.loss_scale
+    for _ in range(config.rounds):
+        manager = pycolmap.ObservationManager(reconstruction)
+        manager.filter_points3D_with_short_tracks(3)
+        if reconstruction.num_points3D() < _FEWEST_POINTS:
+            return
+        pycolmap.bundle_adjustment(reconstruction, options)
+        pycolmap.ObservationManager(reconstruction).filter_all_points3D(
+            config.keep_error, config.keep_angle
+        )
+
+
+# With fewer points than this there is nothing to adjust.
+_FEWEST_POINTS = 30
+
+
+def _read_model(reconstruction: pycolmap.Reconstruction) -> PartialModel:
+    images = sorted(
+        (image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.image_id
+    )
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    index = {point: i for i, point in enumerate(sorted(reconstruction.points3D))}
+    seen = [
+        (image.image_id - 1, feature, index[point2D.point3D_id])
+        for image in images
+        for feature, point2D in enumerate(image.points2D)
+        if point2D.has_point3D()
+    ]
+    table = np.array(seen, dtype=int).reshape(-1, 3)
+    return PartialModel(
+        np.array([image.image_id - 1 for image in images], dtype=int),
+        poses[:, :, :3],
+        poses[:, :, 3],
+        np.array([reconstruction.points3D[point].xyz for point in sorted(index)]).reshape(-1, 3),
+        *table.T,
+    )
