@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 class BundleConfig:
     """Scales of the Cauchy losses, and when to stop."""
 
-    pixel_sigma: float = 0.4  # of a reprojection error, pixels
-    turn_sigma: float = 0.6  # of the change of angular velocity, degrees a frame and frame
-    shift_sigma: float = 0.003  # of the change of velocity, in depths a frame and frame
+    pixel_sigma: float = 0.25  # of a reprojection error, pixels
+    turn_sigma: float = 0.3  # of the change of angular velocity, degrees a frame and frame
+    shift_sigma: float = 0.0015  # of the change of velocity, in depths a frame and frame
     iterations: int = 15
     # Stop when a step lowers the cost by less than this share of it.
     tolerance: float = 1e-4
@@ -48,9 +48,7 @@ class Bundle(NamedTuple):
         return _in_camera(self)[:, 2]
 
 
-def adjust(
-    bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndarray | None = None
-) -> Bundle:
+def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndarray | None = None) -> Bundle:
     """Minimise reprojection errors under the motion prior.
 
     Args:
@@ -79,6 +77,22 @@ def adjust(
         if gain < config.tolerance * cost:
             break
     return bundle
+
+
+def turn_uncertainty(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor: int) -> np.ndarray:
+    """Standard deviation of each frame's rotation against that of frame `anchor`, [T] degrees.
+
+    To first order, for independent reprojection errors of `config.pixel_sigma`. The gauge has no part in it.
+    """
+    free = np.ones(len(bundle.rotations), dtype=bool)
+    system = _linearise(bundle, K, config, free)
+    covariance = np.linalg.pinv(_reduced(system, 0.0)[0], rcond=1e-10, hermitian=True)
+    blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
+    own = np.einsum("titi->t", blocks)
+    # A turn of the anchor by d is seen in frame t as the same turn of the object, carried along.
+    carry = bundle.rotations @ bundle.rotations[anchor].T
+    cross = np.einsum("tij,tij->t", blocks[:, :, anchor], carry)
+    return np.degrees(np.sqrt((own + own[anchor] - 2.0 * cross).clip(0.0)))
 
 
 class _System(NamedTuple):
@@ -115,9 +129,7 @@ def _soft(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _cost(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> float:
     pixel, _ = _cauchy((bundle.residuals(K) ** 2).sum(1) / config.pixel_sigma**2)
     turn, shift = _accelerations(bundle, config)
-    return float(
-        pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
-    )
+    return float(pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum())
 
 
 def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -209,12 +221,26 @@ _SECOND = (1.0, -2.0, 1.0)
 
 def _step(bundle: Bundle, system: _System, free: np.ndarray, damping: float) -> Bundle:
     """One damped Gauss-Newton step."""
+    reduced, scaled, inverse = _reduced(system, damping)
+    frames = int(free.sum())
+    right = scaled @ system.point_gradient.ravel() - system.pose_gradient
+    change = scipy.linalg.solve(reduced, right, assume_a="sym")
+    pull = (system.coupling.T @ change).reshape(-1, 3) + system.point_gradient
+    moved = -np.einsum("nij,nj->ni", inverse, pull)
+    change = change.reshape(frames, 6)
+    rotations, transl = bundle.rotations.copy(), bundle.transl.copy()
+    rotations[free] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotations[free]
+    transl[free] += change[:, 3:]
+    return bundle._replace(rotations=rotations, transl=transl, points=bundle.points + moved)
+
+
+def _reduced(system: _System, damping: float) -> tuple[np.ndarray, scipy.sparse.bsr_matrix, np.ndarray]:
+    """The poses' equations without the points, the coupling times the points' inverse blocks, and those."""
     index = np.arange(3)
     points = system.points.copy()
     points[:, index, index] *= 1.0 + damping
     points[:, index, index] += 1e-9 * (1.0 + np.trace(points, axis1=1, axis2=2))[:, None]
     inverse = np.linalg.inv(points)
-    frames = int(free.sum())
     poses = system.poses.copy()
     poses[np.diag_indices_from(poses)] *= 1.0 + damping
     poses[np.diag_indices_from(poses)] += 1e-9
@@ -224,16 +250,7 @@ def _step(bundle: Bundle, system: _System, free: np.ndarray, damping: float) -> 
         shape=coupling.shape,
         blocksize=(6, 3),
     )
-    reduced = poses - (scaled @ coupling.T).toarray()
-    right = scaled @ system.point_gradient.ravel() - system.pose_gradient
-    change = scipy.linalg.solve(reduced, right, assume_a="sym")
-    pull = (coupling.T @ change).reshape(-1, 3) + system.point_gradient
-    moved = -np.einsum("nij,nj->ni", inverse, pull)
-    change = change.reshape(frames, 6)
-    rotations, transl = bundle.rotations.copy(), bundle.transl.copy()
-    rotations[free] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotations[free]
-    transl[free] += change[:, 3:]
-    return bundle._replace(rotations=rotations, transl=transl, points=bundle.points + moved)
+    return poses - (scaled @ coupling.T).toarray(), scaled, inverse
 
 
 def _cross_matrix(vectors: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,7 @@ class FeatureConfig:
     """How features are found; lengths in pixels are of the clip's images."""
 
     # The object's crop is enlarged by this before SIFT, which decides more than any other setting ...
-    upscale: float = 3.0
+    upscale: float = 2.0
     # ... but not beyond this many pixels on its long side, as in 4K video, which may be reduced instead.
     max_side: int = 1200
     # A third of SIFT's usual contrast threshold: objects are small and evenly lit.
@@ -44,6 +45,17 @@ class _Crop(NamedTuple):
     scale: tuple[float, float]  # enlarged pixels per pixel, horizontally and vertically
 
 
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Let COLMAP log nothing below an error, for as long as the block lasts."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
 def extract_features(
     images: Sequence[np.ndarray], masks: np.ndarray, config: FeatureConfig
 ) -> list[FrameFeatures]:
@@ -58,14 +70,14 @@ def extract_features(
         One entry per frame, without features where the mask is empty.
     """
     boxes = [_box(mask) for mask in masks]
-    largest = max((max(b - t, r - l) for t, b, l, r in filter(None, boxes)), default=1)
+    largest = max((max(box[1] - box[0], box[3] - box[2]) for box in boxes if box is not None), default=1)
     scale = min(config.upscale, config.max_side / largest)
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features = config.max_features
     options.sift.peak_threshold = config.peak_threshold
     features = [_NOTHING] * len(images)
     # pycolmap uses all cores only on files.
-    with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder:
+    with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder, quiet_colmap():
         crops = {}
         for t, (image, box) in enumerate(zip(images, boxes, strict=True)):
             if box is not None:
@@ -86,7 +98,8 @@ def extract_features(
             for name, crop in crops.items():
                 t = int(Path(name).stem)
                 stored = database.read_image_with_name(name)
-                features[t] = _read_features(database, stored.image_id, crop, masks[t])
+                if stored is not None and database.exists_keypoints(stored.image_id):
+                    features[t] = _read_features(database, stored.image_id, crop, masks[t])
     return features
 
 
@@ -117,8 +130,6 @@ def _write_crop(file: Path, image: np.ndarray, box: tuple[int, int, int, int], s
 def _read_features(
     database: pycolmap.Database, image_id: int, crop: _Crop, mask: np.ndarray
 ) -> FrameFeatures:
-    if not database.exists_keypoints(image_id):
-        return _NOTHING
     # Columns are x, y and the 2 x 2 matrix, row by row, that carries a unit patch to the image.
     keypoints = database.read_keypoints(image_id)
     pixels = keypoints[:, :2].astype(np.float64) / crop.scale + (crop.left, crop.top)

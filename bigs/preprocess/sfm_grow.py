@@ -7,17 +7,12 @@ the motion prior while few are left; points that come into view are placed from 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.spatial
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.bundle import Bundle, BundleConfig, adjust
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.tracks import Tracks
+from bigs.preprocess.object_map import ObjectMap
 
 
 @dataclass(frozen=True)
@@ -29,209 +24,39 @@ class GrowConfig:
     moving: int = 4
     # Velocity is the mean over this many steps.
     memory: int = 4
-    # A sighting that is further than this from its point's projection is no sighting, pixels.
-    keep_error: float = 2.0
-    # A point needs rays that differ by this angle, degrees.
-    min_angle: float = 2.0
-    # Known points are sought within this distance of where they should appear, pixels, ...
-    search_radius: float = 5.0
-    # ... from directions that differ by at most this angle from one they were seen from, degrees, ...
-    search_angle: float = 40.0
-    # ... with descriptors whose angle is at most this and this share of that of the next best.
-    search_descriptor: float = 0.65
-    search_ratio: float = 0.9
-    bundle: BundleConfig = field(default_factory=BundleConfig)
+    # Scales of a new frame's reprojection errors while it finds its place, pixels.
+    coarse_sigma: float = 2.0
+    iterations: int = 8
+    # The motion prior is weaker while growing: each prediction is an extrapolation.
+    turn_sigma: float = 0.6
+    shift_sigma: float = 0.003
+    # Rounds of bundle adjustment of everything at the end.
+    rounds: int = 3
 
 
-class ObjectMap:
-    """Poses and points so far, and every sighting with whether it is believed."""
-
-    def __init__(
-        self,
-        features: Sequence[FrameFeatures],
-        tracks: Tracks,
-        model: PartialModel,
-        K: np.ndarray,
-        config: GrowConfig,
-    ) -> None:
-        self.features, self.K, self.config = features, K, config
-        frames = len(features)
-        self.rotations = np.tile(np.eye(3), (frames, 1, 1))
-        self.transl = np.zeros((frames, 3))
-        self.posed = np.zeros(frames, dtype=bool)
-        self.frame, self.feature, self.track = tracks.frame, tracks.feature, tracks.track
-        self.pixels = np.array(
-            [features[t].pixels[i] for t, i in zip(self.frame, self.feature, strict=True)]
-        ).reshape(-1, 2)
-        self.good = np.ones(len(self.frame), dtype=bool)
-        self.points = np.zeros((tracks.count, 3))
-        self.known = np.zeros(tracks.count, dtype=bool)
-        # Turns are about the object's origin, so that has to be in its middle.
-        middle = np.median(model.points, axis=0)
-        self.rotations[model.frames] = model.rotations
-        self.transl[model.frames] = model.transl + model.rotations @ middle
-        self.posed[model.frames] = True
-        self.triangulate()
-
-    def use(self) -> np.ndarray:
-        """Sightings [M] (bool) of known points, believed, in frames with a pose."""
-        return self.good & self.known[self.track] & self.posed[self.frame]
-
-    def triangulate(self) -> None:
-        """Place the points of all tracks that do not have one but have rays enough."""
-        rows = self.good & ~self.known[self.track] & self.posed[self.frame]
-        for _ in range(2):
-            points, fine = self._triangulated(rows)
-            error = np.full(len(rows), np.inf)
-            error[rows] = np.linalg.norm(
-                self._reproject(points, rows) - self.pixels[rows], axis=1
-            )
-            rows &= (error < self.config.keep_error) & fine[self.track]
-        seen = np.bincount(self.track[rows], minlength=len(self.points))
-        new = fine & (seen >= 3) & ~self.known
-        self.points[new] = points[new]
-        self.known |= new
-        tried = self.posed[self.frame] & new[self.track]
-        self.good[tried] = rows[tried]
-
-    def _triangulated(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points [N, 3] nearest to the rays of `rows` [M] (bool), and which [N] have an angle to stand on."""
-        origin, direction = self._rays(rows)
-        track, count = self.track[rows], len(self.points)
-        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        matrix = np.zeros((count, 3, 3))
-        right = np.zeros((count, 3))
-        np.add.at(matrix, track, across)
-        np.add.at(right, track, np.einsum("mij,mj->mi", across, origin))
-        mean = np.zeros((count, 3))
-        np.add.at(mean, track, direction)
-        seen = np.bincount(track, minlength=count)
-        mean /= np.linalg.norm(mean, axis=1, keepdims=True).clip(1e-9)
-        cosine = np.ones(count)
-        np.minimum.at(cosine, track, (direction * mean[track]).sum(1))
-        fine = (seen >= 2) & (cosine < np.cos(np.radians(0.5 * self.config.min_angle)))
-        matrix[~fine] = np.eye(3)
-        return np.linalg.solve(matrix, right[..., None])[..., 0], fine
-
-    def _rays(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Camera centres and unit viewing rays [m, 3] of sightings, in the object frame."""
-        rotation, transl = self.rotations[self.frame[rows]], self.transl[self.frame[rows]]
-        cam = np.concatenate([self.pixels[rows], np.ones((int(rows.sum()), 1))], axis=1)
-        cam = cam @ np.linalg.inv(self.K).T
-        direction = np.einsum("mji,mj->mi", rotation, cam / np.linalg.norm(cam, axis=1, keepdims=True))
-        return -np.einsum("mji,mj->mi", rotation, transl), direction
-
-    def _reproject(self, points: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        t = self.frame[rows]
-        cam = np.einsum("mij,mj->mi", self.rotations[t], points[self.track[rows]]) + self.transl[t]
-        depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
-        return cam[:, :2] / depth[:, None] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
-
-    def judge(self) -> None:
-        """Believe the sightings near their point's projection; forget points with fewer than two left."""
-        rows = self.known[self.track] & self.posed[self.frame]
-        error = np.linalg.norm(self._reproject(self.points, rows) - self.pixels[rows], axis=1)
-        self.good[rows] = error < self.config.keep_error
-        seen = np.bincount(self.track[self.use()], minlength=len(self.points))
-        self.known &= seen >= 2
-
-    def adjust(self, frames: np.ndarray, free: np.ndarray, config: BundleConfig) -> None:
-        """Bundle adjustment of consecutive `frames` [F], of which `free` [F] (bool) may move."""
-        inside = np.zeros(len(self.posed), dtype=bool)
-        inside[frames] = True
-        rows = self.use() & inside[self.frame]
-        tracks, point = np.unique(self.track[rows], return_inverse=True)
-        bundle = Bundle(
-            self.rotations[frames],
-            self.transl[frames],
-            self.points[tracks],
-            self.frame[rows] - frames[0],
-            point,
-            self.pixels[rows],
-        )
-        bundle = adjust(bundle, self.K, config, free=free)
-        self.rotations[frames], self.transl[frames] = bundle.rotations, bundle.transl
-        self.points[tracks] = bundle.points
-
-    def search(self, t: int) -> int:
-        """Look in frame `t` for known points that should be there; the number of sightings found."""
-        features, config = self.features[t], self.config
-        if len(features.pixels) == 0:
-            return 0
-        rows = self.use()
-        here = np.zeros(len(self.points), dtype=bool)
-        here[self.track[self.good & (self.frame == t)]] = True
-        taken = np.zeros(len(features.pixels), dtype=bool)
-        taken[self.feature[self.good & (self.frame == t) & self.known[self.track]]] = True
-        # The sighting from the most similar direction speaks for its point.
-        rows &= ~here[self.track]
-        if not rows.any() or taken.all():
-            return 0
-        origin, _ = self._rays(rows)
-        towards = origin - self.points[self.track[rows]]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        eye = -self.rotations[t].T @ self.transl[t] - self.points[self.track[rows]]
-        eye /= np.linalg.norm(eye, axis=1, keepdims=True)
-        cosine = (towards * eye).sum(1)
-        index = np.flatnonzero(rows)
-        order = np.argsort(-cosine, kind="stable")
-        tracks, best = np.unique(self.track[index[order]], return_index=True)
-        best = order[best]
-        near = cosine[best] > np.cos(np.radians(config.search_angle))
-        tracks, best = tracks[near], index[best[near]]
-        cam = self.points[tracks] @ self.rotations[t].T + self.transl[t]
-        pixels = cam[:, :2] / cam[:, 2:] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
-        free = np.flatnonzero(~taken)
-        tree = scipy.spatial.cKDTree(features.pixels[free])
-        near_by = tree.query_ball_point(pixels, config.search_radius)
-        found: dict[int, tuple[float, int]] = {}
-        for track, sighting, candidates in zip(tracks, best, near_by, strict=True):
-            if not candidates:
-                continue
-            wanted = self.features[self.frame[sighting]].descriptors[self.feature[sighting]]
-            choice = free[candidates]
-            dots = features.descriptors[choice].astype(np.float32) @ wanted.astype(np.float32) / 512.0**2
-            angles = np.arccos(np.clip(dots, -1.0, 1.0))
-            ranked = np.argsort(angles)
-            angle = float(angles[ranked[0]])
-            if angle > config.search_descriptor:
-                continue
-            if len(ranked) > 1 and angle > config.search_ratio * angles[ranked[1]]:
-                continue
-            feature = int(choice[ranked[0]])
-            if feature not in found or angle < found[feature][0]:
-                found[feature] = (angle, int(track))
-        if found:
-            new = np.array(list(found))
-            # A sighting of another, unplaced track gives way.
-            other = (self.frame == t) & np.isin(self.feature, new)
-            self.good[other] = False
-            self.frame = np.concatenate([self.frame, np.full(len(new), t)])
-            self.feature = np.concatenate([self.feature, new])
-            self.track = np.concatenate([self.track, [track for _, track in found.values()]])
-            self.pixels = np.concatenate([self.pixels, features.pixels[new]])
-            self.good = np.concatenate([self.good, np.ones(len(new), dtype=bool)])
-        return len(found)
-
-
-def grow(map_: ObjectMap) -> None:
-    """Give every frame of the clip a pose, in place; gaps first, then outwards from both ends."""
-    config = map_.config
+def grow(map_: ObjectMap, config: GrowConfig) -> None:
+    """Give every frame of the clip a pose, in place: next comes the one that sees most known points."""
+    fine = replace(
+        map_.config.bundle,
+        turn_sigma=config.turn_sigma,
+        shift_sigma=config.shift_sigma,
+        iterations=config.iterations,
+    )
     while not map_.posed.all():
         t, towards = _next_frame(map_)
-        _predict(map_, t, towards)
+        _predict(map_, t, towards, config.memory)
         map_.posed[t] = True
         map_.search(t)
-        frames, free = _window(map_, t, towards)
-        map_.adjust(frames, free & (frames == t), replace(config.bundle, pixel_sigma=2.0, iterations=8))
+        frames, free = _window(map_, t, towards, config)
+        map_.adjust(frames, free & (frames == t), replace(fine, pixel_sigma=config.coarse_sigma))
         map_.judge()
         map_.search(t)
-        map_.adjust(frames, free, replace(config.bundle, iterations=8))
+        map_.adjust(frames, free, fine)
         map_.judge()
         map_.triangulate()
 
 
-def polish(map_: ObjectMap, rounds: int = 3) -> None:
+def polish(map_: ObjectMap, rounds: int) -> None:
     """Bundle adjustment of everything, with points sought again in all frames between the rounds."""
     frames = np.arange(len(map_.posed))
     everything = np.ones(len(frames), dtype=bool)
@@ -240,15 +65,13 @@ def polish(map_: ObjectMap, rounds: int = 3) -> None:
         map_.judge()
         map_.triangulate()
         if round_ + 1 < rounds:
-            for t in frames:
+            for t in range(len(frames)):
                 map_.search(t)
 
 
 def _next_frame(map_: ObjectMap) -> tuple[int, int]:
     """The frame to add, and the direction in time (+1 or -1) from the poses that lead to it."""
-    known = np.bincount(
-        map_.frame[map_.good & map_.known[map_.track]], minlength=len(map_.posed)
-    )
+    known = np.bincount(map_.frame[map_.good & map_.known[map_.track]], minlength=len(map_.posed))
     options = [
         (known[t + step], t + step, step)
         for t in np.flatnonzero(map_.posed)
@@ -259,10 +82,10 @@ def _next_frame(map_: ObjectMap) -> tuple[int, int]:
     return int(t), step
 
 
-def _predict(map_: ObjectMap, t: int, step: int) -> None:
+def _predict(map_: ObjectMap, t: int, step: int, memory: int) -> None:
     """The pose of frame `t` if the object goes on as in the frames before it (or after it)."""
     before = [t - step]
-    while len(before) <= map_.config.memory and (
+    while len(before) <= memory and (
         0 <= before[-1] - step < len(map_.posed) and map_.posed[before[-1] - step]
     ):
         before.append(before[-1] - step)
@@ -276,12 +99,12 @@ def _predict(map_: ObjectMap, t: int, step: int) -> None:
     map_.transl[t] = map_.transl[last] + (map_.transl[last] - map_.transl[before[-1]]) / steps
 
 
-def _window(map_: ObjectMap, t: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+def _window(map_: ObjectMap, t: int, step: int, config: GrowConfig) -> tuple[np.ndarray, np.ndarray]:
     """Consecutive posed frames about `t`, mostly on the side it was reached from, and which may move."""
     lower = upper = t
-    while lower > 0 and map_.posed[lower - 1] and t - lower < map_.config.window:
+    while lower > 0 and map_.posed[lower - 1] and t - lower < config.window:
         lower -= 1
-    while upper + 1 < len(map_.posed) and map_.posed[upper + 1] and upper - t < map_.config.window:
+    while upper + 1 < len(map_.posed) and map_.posed[upper + 1] and upper - t < config.window:
         upper += 1
     frames = np.arange(lower, upper + 1)
-    return frames, (np.abs(frames - t) < map_.config.moving) & ((t - frames) * step >= 0)
+    return frames, (np.abs(frames - t) < config.moving) & ((t - frames) * step >= 0)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from bigs.preprocess.sfm_features import FrameFeatures
+from bigs.preprocess.sfm_features import FrameFeatures, quiet_colmap
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,18 @@ class MappingConfig:
     loss_scale: float = 0.5
     keep_error: float = 1.5
     keep_angle: float = 1.5
+    # Least matches of a pair, of a first pair, and of a frame that is added, and their share of all.
+    pair_inliers: int = 15
+    init_inliers: int = 100
+    pose_inliers: int = 30
+    pose_share: float = 0.25
     seed: int = 0
+
+    def loosened(self) -> MappingConfig:
+        """For objects with little texture. Models found so need to be checked: many are wrong."""
+        return replace(
+            self, init_angle=6.0, pair_inliers=10, init_inliers=30, pose_inliers=12, pose_share=0.15
+        )
 
 
 class PartialModel(NamedTuple):
@@ -71,7 +82,7 @@ def map_features(
         known_focal: whether the focal length in `K` is to be believed or is only a first guess.
         config: see there.
     """
-    with tempfile.TemporaryDirectory(prefix="bigs-sfm-") as folder:
+    with tempfile.TemporaryDirectory(prefix="bigs-sfm-") as folder, quiet_colmap():
         file = Path(folder) / "clip.db"
         _write_database(file, features, K, size, known_focal)
         _match(file, config)
@@ -133,6 +144,7 @@ def _match(file: Path, config: MappingConfig) -> None:
         overlap=config.overlap, quadratic_overlap=False, loop_detection=False
     )
     verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = config.pair_inliers
     verification.ransac.max_error = config.match_error
     verification.ransac.random_seed = config.seed
     pycolmap.match_sequential(
@@ -166,6 +178,9 @@ def _pipeline_options(known_focal: bool, config: MappingConfig) -> pycolmap.Incr
     )
     mapper = options.mapper
     mapper.init_min_tri_angle = config.init_angle
+    mapper.init_min_num_inliers = config.init_inliers
+    mapper.abs_pose_min_num_inliers = config.pose_inliers
+    mapper.abs_pose_min_inlier_ratio = config.pose_share
     mapper.init_max_error = config.match_error
     mapper.abs_pose_max_error = config.pose_error
     mapper.abs_pose_refine_focal_length = not known_focal
@@ -191,9 +206,7 @@ def _refine(reconstruction: pycolmap.Reconstruction, known_focal: bool, config: 
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return
         pycolmap.bundle_adjustment(reconstruction, options)
-        pycolmap.ObservationManager(reconstruction).filter_all_points3D(
-            config.keep_error, config.keep_angle
-        )
+        pycolmap.ObservationManager(reconstruction).filter_all_points3D(config.keep_error, config.keep_angle)
 
 
 # With fewer points than this there is nothing to adjust.
@@ -202,7 +215,8 @@ _FEWEST_POINTS = 30
 
 def _read_model(reconstruction: pycolmap.Reconstruction) -> PartialModel:
     images = sorted(
-        (image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.image_id
+        (image for image in reconstruction.images.values() if image.has_pose),
+        key=lambda image: image.image_id,
     )
     poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     index = {point: i for i, point in enumerate(sorted(reconstruction.points3D))}

@@ -16,7 +16,7 @@ class Tracks(NamedTuple):
     frame: np.ndarray  # [M]
     feature: np.ndarray  # [M] which of the frame's features
     track: np.ndarray  # [M]
-    count: int  # number of tracks
+    total: int  # number of tracks
 
 
 def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence[int]) -> Tracks:
@@ -30,9 +30,7 @@ def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence
         Tracks of two sightings or more.
     """
     first = np.concatenate([[0], np.cumsum(counts)])
-    pairs = [
-        pair + (first[a], first[b]) for (a, b), pair in matches.items() if len(pair)
-    ]
+    pairs = [pair + first[[a, b]] for (a, b), pair in matches.items() if len(pair)]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=int)
     graph = scipy.sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(first[-1], first[-1]))
     _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)

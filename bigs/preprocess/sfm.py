@@ -1,0 +1,252 @@
+"""The object's pose in every frame and its points, by structure from motion on its masked pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from bigs.checks import InputError
+from bigs.preprocess.artefacts import ObjectSfm
+from bigs.preprocess.object_map import MapConfig, ObjectMap
+from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
+from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_features
+from bigs.preprocess.sfm_grow import GrowConfig, grow, polish
+from bigs.preprocess.sfm_models import Mapping, MappingConfig, map_features
+from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
+from bigs.preprocess.sfm_seed import Seed, find_seed
+from bigs.preprocess.tracks import Tracks, join_matches
+from bigs.types import MASK_VALUES
+
+
+@dataclass(frozen=True)
+class SfmConfig:
+    """The whole of structure from motion."""
+
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    grow: GrowConfig = field(default_factory=GrowConfig)
+    checks: CheckConfig = field(default_factory=CheckConfig)
+    # How many partial models are tried as the start before the best outcome is taken.
+    seeds: int = 3
+
+
+class SfmReport(NamedTuple):
+    """What a person should know about the outcome, frame by frame."""
+
+    features: np.ndarray  # [T] features on the object
+    neighbour_matches: np.ndarray  # [T] verified matches with the next frame; 0 for the last
+    models: list[list[int]]  # frames of each partial model, the one that was started from first
+    model: np.ndarray  # [T] which of `models` had the frame; -1 for none
+    checks: SfmChecks
+    focal: float  # pixels; estimated unless it was known
+    tried: int  # partial models that were tried as the start
+
+    def sentences(self) -> list[str]:
+        """The outcome in plain words: what is wrong, with frame ranges, and what could be done."""
+        words: list[str] = []
+        for flag in dict.fromkeys(word for frame in self.checks.flags for word in frame):
+            frames = [t for t, frame in enumerate(self.checks.flags) if flag in frame]
+            words.append(f"frames {frame_ranges(frames)}: {_EXPLAINED[flag]}")
+        return words
+
+
+_EXPLAINED = {
+    "few points": "too few points of the object were seen, so its motion before and after stands in",
+    "tied loosely": "hardly any point ties them to the rest, so their turn may be off by several degrees",
+    "depth may be reversed": "its mirror image in depth fits better, so the turn may be the wrong way",
+    "turn changes": "the turn changes abruptly; look whether the hand really did that",
+    "long step": "the object jumps between two frames",
+}
+
+
+def structure_from_motion(
+    images: Sequence[np.ndarray],
+    masks: np.ndarray,
+    K: np.ndarray,
+    config: SfmConfig,
+    *,
+    known_focal: bool = True,
+) -> tuple[ObjectSfm, SfmReport]:
+    """Poses of the object in all frames, and its points.
+
+    Partial models come from pycolmap. The best one is checked for reversed depth and grown over the clip by
+    tracking, so that models need not be joined afterwards.
+
+    Args:
+        images: T arrays [H, W, 3] uint8.
+        masks: [T, H, W] labels of `bigs.types.MASK_VALUES`.
+        K: [3, 3] intrinsics.
+        config: see there.
+        known_focal: whether the focal length in `K` is right; if not, it is estimated, and `report.focal`
+            is what the poses go with.
+
+    Returns:
+        The poses, in structure from motion's own unit, and the report. Frames that the object cannot be
+        placed in are filled from their neighbours; `valid` is false there.
+
+    Raises:
+        InputError: the masks do not show the object, or it has too little texture.
+    """
+    shown = np.flatnonzero((masks == MASK_VALUES["object"]).any((1, 2)))
+    if len(shown) < _FEWEST_FRAMES:
+        raise InputError(
+            f"object poses: expected masks that show the object (value {MASK_VALUES['object']}) in at least "
+            f"{_FEWEST_FRAMES} frames, found it in {len(shown)} of {len(masks)}"
+        )
+    first, last = int(shown[0]), int(shown[-1]) + 1
+    clip = slice(first, last)
+    object_masks = masks[clip] == MASK_VALUES["object"]
+    features = extract_features(images[clip], object_masks, config.features)
+    size = (masks.shape[2], masks.shape[1])
+    mapping = _map(features, K, size, known_focal, config.mapping)
+    K = K.copy()
+    K[0, 0], K[1, 1] = mapping.focal, mapping.focal * K[1, 1] / K[0, 0]
+    tracks = join_matches(mapping.matches, [len(frame.pixels) for frame in features])
+    attempt, tried = _best_attempt(features, tracks, mapping, K, config)
+    report = _report(attempt, tried, mapping, features, (first, len(masks) - last))
+    return _result(attempt.map, report, images[clip], first, config), report
+
+
+# Fewer frames than this say nothing about depth.
+_FEWEST_FRAMES = 5
+
+
+class _Attempt(NamedTuple):
+    map: ObjectMap
+    seed: Seed
+    model: int
+    checks: SfmChecks
+
+
+def _map(
+    features: Sequence[FrameFeatures],
+    K: np.ndarray,
+    size: tuple[int, int],
+    known_focal: bool,
+    config: MappingConfig,
+) -> Mapping:
+    """Partial models; with loosened thresholds when the usual ones give none, since the best is checked."""
+    mapping = map_features(features, K, size, known_focal, config)
+    if not mapping.models:
+        mapping = map_features(features, K, size, known_focal, config.loosened())
+    if not mapping.models:
+        counts = [len(frame.pixels) for frame in features]
+        matches = _neighbour_matches(mapping, len(features))[:-1]
+        raise InputError(
+            f"object poses: expected about 100 features a frame and 30 matches between neighbours, found "
+            f"{np.median(counts):.0f} and {np.median(matches):.0f} (medians of {len(counts)} frames): the "
+            "object has too little texture or hardly turns; supply its poses as processed/object_sfm.npz, "
+            "or film it closer, in better light, or with a pattern on it"
+        )
+    return mapping
+
+
+def _best_attempt(
+    features: Sequence[FrameFeatures], tracks: Tracks, mapping: Mapping, K: np.ndarray, config: SfmConfig
+) -> tuple[_Attempt, int]:
+    """Start from one model after another until nothing serious is found, else take the best outcome."""
+    best: _Attempt | None = None
+    tried = 0
+    for number, model in enumerate(mapping.models[: config.seeds]):
+        map_ = ObjectMap(features, tracks, K, config.map)
+        seed = find_seed(map_, model)
+        if seed is None:
+            continue
+        tried += 1
+        grow(map_, config.grow)
+        polish(map_, config.grow.rounds)
+        attempt = _Attempt(map_, seed, number, check_map(map_, features, tracks, config.checks))
+        if best is None or _rank(attempt) > _rank(best):
+            best = attempt
+        if not best.checks.doubtful().any():
+            break
+    if best is None:
+        sizes = ", ".join(str(len(model.frames)) for model in mapping.models)
+        raise InputError(
+            f"object poses: expected a model that moves smoothly, found {len(mapping.models)} (of {sizes} "
+            "frames) that all jump; film the object turning more slowly, or supply processed/object_sfm.npz"
+        )
+    return best, tried
+
+
+def _rank(attempt: _Attempt) -> tuple[int, int]:
+    return -int(attempt.checks.doubtful().sum()), int(attempt.checks.sightings.sum())
+
+
+def _neighbour_matches(mapping: Mapping, frames: int) -> np.ndarray:
+    return np.array([len(mapping.matches.get((t, t + 1), ())) for t in range(frames)])
+
+
+def _report(
+    attempt: _Attempt,
+    tried: int,
+    mapping: Mapping,
+    features: Sequence[FrameFeatures],
+    outside: tuple[int, int],
+) -> SfmReport:
+    """The report over the whole clip; `outside` counts the frames without object at its ends."""
+    before, after = outside
+    order = [attempt.model, *(i for i in range(len(mapping.models)) if i != attempt.model)]
+    models = [[int(t) + before for t in mapping.models[i].frames] for i in order]
+    frames = len(features)
+    model = np.full(before + frames + after, -1)
+    for number in reversed(range(len(models))):
+        model[models[number]] = number
+    pad = lambda values, fill: np.pad(values, outside, constant_values=fill)  # noqa: E731
+    checks = attempt.checks
+    nothing = [["few points"]]
+    return SfmReport(
+        features=pad(np.array([len(frame.pixels) for frame in features]), 0),
+        neighbour_matches=pad(_neighbour_matches(mapping, frames), 0),
+        models=models,
+        model=model,
+        checks=SfmChecks(
+            pad(checks.sightings, 0),
+            pad(checks.uncertainty, 180.0),
+            pad(checks.mirror, 0.0),
+            pad(checks.cosine, 1.0),
+            nothing * before + checks.flags + nothing * after,
+        ),
+        focal=mapping.focal,
+        tried=tried,
+    )
+
+
+def _result(
+    map_: ObjectMap, report: SfmReport, images: Sequence[np.ndarray], first: int, config: SfmConfig
+) -> ObjectSfm:
+    """The outcome over the whole clip, of which the map's frames start at `first`."""
+    seen = np.bincount(map_.track[map_.use()], minlength=len(map_.points))
+    tracks = np.flatnonzero(map_.known & (seen >= config.map.least_sightings))
+    colors = color_points(map_, tracks, images)
+    keep = trim_points(map_.points[tracks])
+    points = map_.points[tracks[keep]]
+    # Beyond the first and the last frame that shows the object, its pose is that of the nearest one.
+    place = np.clip(np.arange(len(report.model)) - first, 0, len(map_.posed) - 1)
+    checks, least = report.checks, config.checks.least_sightings
+    many = checks.sightings / (checks.sightings + 4.0 * least)
+    sure = many * np.exp(-checks.uncertainty / config.checks.most_uncertain)
+    return ObjectSfm(
+        rotations=map_.rotations[place],
+        transl=map_.transl[place],
+        valid=checks.sightings >= least,
+        confidence=np.where(checks.doubtful(), 0.0, sure),
+        points=points,
+        colors=colors[keep],
+        norm_mat=normalisation(points),
+    )
+
+
+def frame_ranges(frames: Sequence[int]) -> str:
+    """Frame numbers in ascending order as text, runs shortened: "0, 3-5"."""
+    runs: list[list[int]] = []
+    for t in frames:
+        if runs and t == runs[-1][-1] + 1:
+            runs[-1].append(t)
+        else:
+            runs.append([t])
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)

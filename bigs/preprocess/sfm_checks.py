@@ -1,0 +1,129 @@
+"""Signs that object poses are wrong, none of which needs the truth.
+
+The number of frames with a pose and the reprojection error say nothing: a wrong model can have all frames and
+a third of a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bigs.preprocess.bundle import turn_uncertainty
+from bigs.preprocess.object_map import MapConfig, ObjectMap
+from bigs.preprocess.sfm_features import FrameFeatures
+from bigs.preprocess.sfm_seed import mirror_misfits
+from bigs.preprocess.tracks import Tracks
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """When a frame is flagged."""
+
+    # Fewer sightings than this do not make a pose; the motion does.
+    least_sightings: int = 8
+    # A standard deviation of the rotation that the observations alone leave open, degrees.
+    most_uncertain: float = 1.5
+    # Cosine between the mean angular velocities of the five frames before and after.
+    least_cosine: float = 0.8
+    # A step that is longer than this many usual ones, and than this angle, degrees.
+    long_step: float = 2.0
+    least_long_step: float = 8.0
+    # The mirror image in depth fits nearly as well as this share of the pose's own misfit says.
+    mirror_share: float = 1.0
+    # Frames that are compared with their mirror image together, half of them with the next ones too.
+    mirror_window: int = 20
+
+
+class SfmChecks(NamedTuple):
+    """What was found in each frame."""
+
+    sightings: np.ndarray  # [T] believed sightings of points
+    uncertainty: np.ndarray  # [T] degrees against the frame that is tied best
+    mirror: np.ndarray  # [T] misfit over that of the mirror image, the worst window's; above 1 is wrong
+    cosine: np.ndarray  # [T] of angular velocity before and after; 1 where nothing turns
+    flags: list[list[str]]  # T lists of plain words; empty where nothing is wrong
+
+    def doubtful(self) -> np.ndarray:
+        """Frames [T] (bool) whose pose should not be relied on."""
+        return np.array([bool(set(words) & _SERIOUS) for words in self.flags])
+
+
+FEW = "few points"
+LOOSE = "tied loosely"
+REVERSED = "depth may be reversed"
+TURN = "turn changes"
+STEP = "long step"
+# A turn that changes may be real; the others are not.
+_SERIOUS = {FEW, LOOSE, REVERSED, STEP}
+
+
+def check_map(
+    map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, config: CheckConfig
+) -> SfmChecks:
+    """All checks of a map whose frames all have poses. `tracks` are those of the matches alone."""
+    frames = len(map_.posed)
+    sightings = np.bincount(map_.frame[map_.use()], minlength=frames)
+    bundle, _ = map_.bundle(np.arange(frames))
+    # The prior is all but lifted: what counts is what the observations say.
+    loose = replace(map_.config.bundle, turn_sigma=3.0, shift_sigma=0.015)
+    uncertainty = turn_uncertainty(bundle, map_.K, loose, int(sightings.argmax()))
+    mirror = _mirror_ratios(map_, features, tracks, config.mirror_window)
+    cosine = turn_cosines(map_.rotations)
+    steps = _step_angles(map_.rotations)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    long_step = np.zeros(frames, dtype=bool)
+    for t in np.flatnonzero(steps > max(config.long_step * usual, config.least_long_step)):
+        long_step[t : t + 2] = True
+    signs = {
+        FEW: sightings < config.least_sightings,
+        LOOSE: uncertainty > config.most_uncertain,
+        REVERSED: mirror > config.mirror_share,
+        TURN: cosine < config.least_cosine,
+        STEP: long_step,
+    }
+    flags = [[word for word, found in signs.items() if found[t]] for t in range(frames)]
+    return SfmChecks(sightings, uncertainty, mirror, cosine, flags)
+
+
+def turn_cosines(rotations: np.ndarray, reach: int = 5) -> np.ndarray:
+    """Cosine [T] between the mean angular velocities of the `reach` frames before and after each frame.
+
+    1 where either side turns by less than a degree a frame, or has no frames.
+    """
+    velocity = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec(degrees=True)
+    cosine = np.ones(len(rotations))
+    for t in range(reach, len(rotations) - reach):
+        before, after = velocity[t - reach : t].mean(0), velocity[t : t + reach].mean(0)
+        lengths = np.linalg.norm(before), np.linalg.norm(after)
+        if min(lengths) > 1.0:
+            cosine[t] = before @ after / (lengths[0] * lengths[1])
+    return cosine
+
+
+def _step_angles(rotations: np.ndarray) -> np.ndarray:
+    steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+    return np.degrees(steps.magnitude())
+
+
+def _mirror_ratios(
+    map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, window: int
+) -> np.ndarray:
+    """For each frame, the largest over windows of own misfit over the mirror image's."""
+    frames = len(map_.posed)
+    ratios = np.zeros(frames)
+    trial = ObjectMap(features, tracks, map_.K, MapConfig())
+    starts = range(0, max(frames - window // 2, 1), max(window // 2, 1))
+    for start in starts:
+        inside = np.arange(start, min(start + window, frames))
+        if len(inside) < 3:
+            continue
+        trial.rotations[:], trial.transl[:] = map_.rotations, map_.transl
+        own, mirrored = mirror_misfits(trial, inside)
+        if np.isfinite(own) and np.isfinite(mirrored) and mirrored > 0:
+            ratios[inside] = np.maximum(ratios[inside], own / mirrored)
+    return ratios

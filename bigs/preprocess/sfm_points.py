@@ -1,0 +1,41 @@
+"""The object's points after structure from motion: strays left out, coloured, brought to unit size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bigs.preprocess.object_map import ObjectMap
+
+
+def trim_points(points: np.ndarray) -> np.ndarray:
+    """Which points [N] (bool) lie within 1.5 times the 80th percentile of the distances from their median."""
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return distance <= 1.5 * np.percentile(distance, 80)
+
+
+def normalisation(points: np.ndarray) -> np.ndarray:
+    """HOLD's `norm_mat` [4, 4]: moves the bounding box's centre to 0 and the farthest point to distance 1."""
+    centre = 0.5 * (points.min(0) + points.max(0))
+    radius = np.linalg.norm(points - centre, axis=1).max()
+    matrix = np.diag([1.0 / radius] * 3 + [1.0])
+    matrix[:3, 3] = -centre / radius
+    return matrix
+
+
+def color_points(map_: ObjectMap, tracks: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:
+    """Colours [N, 3] uint8 of the points `tracks` [N]: the median over their sightings' pixels."""
+    slot = np.full(len(map_.points), -1)
+    slot[tracks] = np.arange(len(tracks))
+    rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))
+    column, row = np.floor(map_.pixels[rows]).astype(int).T
+    found = np.empty((len(rows), 3))
+    for t in np.unique(map_.frame[rows]):
+        here = map_.frame[rows] == t
+        height, width = images[t].shape[:2]
+        found[here] = images[t][row[here].clip(0, height - 1), column[here].clip(0, width - 1)]
+    order = np.argsort(slot[map_.track[rows]], kind="stable")
+    _, starts = np.unique(slot[map_.track[rows]][order], return_index=True)
+    medians = [np.median(group, axis=0) for group in np.split(found[order], starts[1:])]
+    return np.round(medians).astype(np.uint8).reshape(-1, 3)

@@ -1,0 +1,84 @@
+"""The start of a map: a run of one model's frames that moves smoothly, in the better of two mirror images.
+
+Through a long lens an object that turns one way looks nearly like its mirror image in depth that turns the
+other way, and structure from motion may settle on either. Only the perspective tells them apart, so both are
+adjusted and compared.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bigs.preprocess.object_map import ObjectMap
+from bigs.preprocess.sfm_models import PartialModel
+
+_FLIP = np.diag([1.0, 1.0, -1.0])
+
+# A change of angular velocity by more than this within one frame is no motion but an error, degrees.
+_KINK = 2.5
+
+
+class Seed(NamedTuple):
+    """Poses of consecutive frames."""
+
+    frames: np.ndarray  # [F]
+    rotations: np.ndarray  # [F, 3, 3]
+    transl: np.ndarray  # [F, 3], of the middle of the points
+    misfit: float  # of the map that grows from these frames alone
+    mirror_misfit: float  # the same of their mirror image
+
+
+def find_seed(map_: ObjectMap, model: PartialModel) -> Seed | None:
+    """The longest smooth run of `model`, adjusted, in the better mirror image; None if it has none.
+
+    `map_` is used to try it and left with the seed's poses and points.
+    """
+    run = smooth_run(model.frames, model.rotations)
+    if len(run) < 3:
+        return None
+    middle = np.median(model.points, axis=0)
+    transl = model.transl + model.rotations @ middle
+    tried = []
+    for flip in (np.eye(3), _FLIP):
+        map_.restart(model.frames[run], flip @ model.rotations[run] @ flip, transl[run])
+        map_.settle()
+        frames = model.frames[run]
+        tried.append((map_.misfit(), map_.rotations[frames].copy(), map_.transl[frames].copy()))
+    better, worse = sorted(tried, key=lambda entry: entry[0])
+    seed = Seed(model.frames[run], better[1], better[2], better[0], worse[0])
+    map_.restart(seed.frames, seed.rotations, seed.transl)
+    map_.settle()
+    return seed
+
+
+def smooth_run(frames: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Which entries [n] of a model form its longest run of consecutive frames that turn without a kink."""
+    if len(frames) < 3:
+        return np.arange(len(frames))
+    steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
+    velocity = steps.as_rotvec(degrees=True) / np.diff(frames)[:, None]
+    kink = np.linalg.norm(np.diff(velocity, axis=0), axis=1) > _KINK
+    # A step is broken if frames are missing in it; a run ends at the middle of a kink.
+    broken = np.diff(frames) > 1
+    cut = broken.copy()
+    cut[1:] |= kink
+    cut[:-1] |= kink
+    piece = np.concatenate([[0], np.cumsum(cut)])
+    return np.flatnonzero(piece == np.bincount(piece).argmax())
+
+
+def mirror_misfits(map_: ObjectMap, frames: np.ndarray) -> tuple[float, float]:
+    """How badly consecutive `frames`, adjusted by themselves, fit as they are and mirrored in depth.
+
+    `map_` is changed; give a copy.
+    """
+    rotations, transl = map_.rotations[frames].copy(), map_.transl[frames].copy()
+    misfits = []
+    for flip in (np.eye(3), _FLIP):
+        map_.restart(frames, flip @ rotations @ flip, transl)
+        map_.settle()
+        misfits.append(map_.misfit())
+    return misfits[0], misfits[1]

@@ -1,0 +1,122 @@
+"""Tracks, seeds, growth and the truth-free checks, on exact scenes and on injected faults."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from turning_object import TurningObject, rotation_errors, turning_object
+
+from bigs.preprocess.object_map import ObjectMap
+from bigs.preprocess.sfm_checks import FEW, LOOSE, REVERSED, TURN, CheckConfig, check_map, turn_cosines
+from bigs.preprocess.sfm_grow import GrowConfig, grow, polish
+from bigs.preprocess.sfm_seed import find_seed, smooth_run
+from bigs.preprocess.tracks import join_matches
+
+FLIP = np.diag([1.0, 1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def egg() -> TurningObject:
+    return turning_object()
+
+
+def at_truth(egg: TurningObject) -> ObjectMap:
+    found = egg.map()
+    found.restart(np.arange(len(egg.rotations)), egg.rotations, egg.transl)
+    return found
+
+
+def test_matches_join_into_tracks() -> None:
+    tracks = join_matches({(0, 1): np.array([[0, 2]]), (1, 2): np.array([[2, 1], [0, 0]])}, [2, 3, 2])
+    found = {
+        tuple(zip(tracks.frame[tracks.track == i], tracks.feature[tracks.track == i], strict=True))
+        for i in range(tracks.total)
+    }
+    assert found == {((0, 0), (1, 2), (2, 1)), ((1, 0), (2, 0))}
+
+
+def test_two_features_of_a_frame_are_not_one_point() -> None:
+    matches = {(0, 1): np.array([[0, 0]]), (1, 2): np.array([[0, 0]]), (0, 2): np.array([[1, 0]])}
+    tracks = join_matches(matches, [2, 1, 1])
+    assert list(tracks.frame) == [1, 2]
+
+
+def test_no_matches_give_no_tracks() -> None:
+    assert join_matches({}, [3, 0]).total == 0
+
+
+def test_a_kink_ends_a_run() -> None:
+    turn = np.concatenate([np.full(6, 5.0), [40.0], np.full(9, 5.0)])
+    rotations = Rotation.from_rotvec(np.radians(np.cumsum(turn))[:, None] * (0, 1, 0)).as_matrix()
+    assert list(smooth_run(np.arange(16), rotations)) == list(range(7, 16))
+    frames = np.concatenate([np.arange(10), np.arange(20, 26)])
+    steady = Rotation.from_rotvec(np.radians(5.0 * frames)[:, None] * (0, 1, 0)).as_matrix()
+    assert list(smooth_run(frames, steady)) == list(range(10))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_seed_is_the_image_that_perspective_allows(egg: TurningObject, mirrored: bool) -> None:
+    seed = find_seed(egg.map(), egg.model(range(5, 25), mirrored))
+    assert seed is not None
+    assert seed.misfit < 0.7 * seed.mirror_misfit
+    assert rotation_errors(seed.rotations, egg.rotations[seed.frames]).max() < 1.0
+
+
+def test_growth_crosses_frames_that_show_next_to_nothing() -> None:
+    egg = turning_object(hidden=(24, 25), shown_there=5, seed=1)
+    found = egg.map()
+    assert find_seed(found, egg.model(range(4, 22))) is not None
+    grow(found, GrowConfig())
+    polish(found, 2)
+    errors = rotation_errors(found.rotations, egg.rotations)
+    assert np.median(errors) < 0.5 and np.percentile(errors, 90) < 1.5
+    assert np.bincount(found.frame[found.use()], minlength=40)[26:].min() > 50
+
+
+def test_the_search_finds_points_that_were_never_matched(egg: TurningObject) -> None:
+    found = at_truth(egg)
+    found.good[found.frame == 12] = False
+    assert found.search(12) > 100
+    new = found.use() & (found.frame == 12)
+    errors = np.linalg.norm(found.reproject(new) - found.pixels[new], axis=1)
+    assert np.percentile(errors, 90) < 1.0
+
+
+def test_nothing_is_flagged_where_nothing_is_wrong(egg: TurningObject) -> None:
+    checks = check_map(at_truth(egg), egg.features, egg.tracks(), CheckConfig())
+    assert not any(checks.flags)
+    assert checks.mirror.max() < 0.9
+
+
+def test_a_reversed_segment_is_flagged(egg: TurningObject) -> None:
+    rotations = egg.rotations.copy()
+    # From frame 20 on the mirror image, joined so that no single step is too long.
+    join = egg.rotations[20]
+    back = FLIP @ (egg.rotations[20:] @ join.T) @ FLIP @ join
+    rotations[20:] = back
+    found = egg.map()
+    found.restart(np.arange(40), rotations, egg.transl)
+    checks = check_map(found, egg.features, egg.tracks(), CheckConfig())
+    assert all(REVERSED in words for words in checks.flags[25:])
+    assert checks.doubtful()[25:].all()
+    assert any(TURN in words for words in checks.flags[17:24])
+    assert not any(REVERSED in words for words in checks.flags[:10])
+
+
+def test_frames_that_see_nothing_and_what_hangs_behind_them_are_flagged() -> None:
+    egg = turning_object(hidden=range(22, 29), seed=2)
+    found = at_truth(egg)
+    checks = check_map(found, egg.features, egg.tracks(), CheckConfig())
+    assert all(FEW in checks.flags[t] for t in range(22, 29))
+    assert not any(FEW in checks.flags[t] for t in range(20))
+    assert all(LOOSE in words for words in checks.flags[22:29])
+
+
+def test_a_turn_that_goes_back_is_a_warning_and_no_more() -> None:
+    angle = np.concatenate([np.arange(15), np.arange(13, 0, -1)]) * 5.0
+    rotations = Rotation.from_rotvec(np.radians(angle)[:, None] * (0, 1, 0)).as_matrix()
+    cosine = turn_cosines(rotations)
+    assert cosine[14] < 0.0 and cosine[:8].min() > 0.99
+    still = np.tile(np.eye(3), (20, 1, 1))
+    assert (turn_cosines(still) == 1.0).all()
