@@ -12,12 +12,14 @@ from bigs.data.arctic import find_arctic, load_arctic
 from bigs.data.base import Clip
 from bigs.data.ho3d import find_ho3d, load_ho3d
 from bigs.data.hold import load_hold
+from bigs.data.sfm_folder import is_sfm_folder, load_sfm_folder
 
-Layout = Literal["hold", "arctic", "ho3d"]
+Layout = Literal["hold", "arctic", "ho3d", "sfm"]
 LAYOUT_NAMES: dict[Layout, str] = {
     "hold": "HOLD / HANDS-challenge build folder",
     "arctic": "ARCTIC raw sequence",
     "ho3d": "HO-3D clip",
+    "sfm": "COLMAP or nerfstudio folder with hands.npz",
 }
 
 
@@ -30,6 +32,8 @@ def layout_of(path: str | Path) -> Layout:
     path = Path(path)
     if (path / "build").is_dir() or any((path / part).exists() for part in ("data.npy", "corres.txt")):
         return "hold"
+    if is_sfm_folder(path):
+        return "sfm"
     if path.is_dir() and find_ho3d(path) is not None:
         return "ho3d"
     if find_arctic(path) is not None:
@@ -53,4 +57,6 @@ def load_clip(path: str | Path, hands_mean: np.ndarray) -> Clip:
         return load_arctic(path)
     if layout == "ho3d":
         return load_ho3d(path, hands_mean)
+    if layout == "sfm":
+        return load_sfm_folder(path)
     return load_hold(path)

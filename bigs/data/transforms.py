@@ -35,6 +35,17 @@ class RenderCamera(NamedTuple):
     height: int
 
 
+class PlacedCamera(NamedTuple):
+    """A frame of the file: where its camera stood, and all that the file says of it."""
+
+    where: str  # names it in messages
+    entry: Mapping[str, Any]
+    viewmat: np.ndarray  # [4, 4] world to camera, OpenCV axes
+    K: np.ndarray  # [3, 3]
+    width: int
+    height: int
+
+
 def load_transforms(path: str | Path, *, frame_count: int | None = None) -> list[RenderCamera]:
     """Read the cameras of a `transforms.json`, in the file's order.
 
@@ -45,26 +56,39 @@ def load_transforms(path: str | Path, *, frame_count: int | None = None) -> list
     Raises:
         InputError: not JSON, a missing field, distortion, a matrix that is not rigid, a frame out of range.
     """
+    cameras = []
+    for camera in read_cameras(path):
+        frame_index = _count(camera.where, camera.entry, "frame_index", 0)
+        if frame_count is not None and frame_index >= frame_count:
+            raise InputError(
+                f"{camera.where}.frame_index: expected at most {frame_count - 1}, the clip's last frame, "
+                f"found {frame_index}"
+            )
+        cameras.append(RenderCamera(frame_index, camera.viewmat, camera.K, camera.width, camera.height))
+    return cameras
+
+
+def read_cameras(path: str | Path) -> list[PlacedCamera]:
+    """The cameras of a `transforms.json` as they stand, whatever their frames are called.
+
+    Raises:
+        InputError: as `load_transforms`.
+    """
     path = Path(path)
     document = mapping_field(str(path), read_json(path))
     frames = require(f"{path}: frames", document, "frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames: expected a list of cameras, found {_brief(frames)}")
     cameras = []
-    for index, entry in enumerate(frames):
+    for index, stored in enumerate(frames):
         where = f"{path}: frames[{index}]"
+        entry = mapping_field(where, stored)
         # What a frame says about its lens overrides what the file says for all.
-        values = {**document, **mapping_field(where, entry)}
+        values = {**document, **entry}
         _check_lens(where, values)
         width, height = _count(where, values, "w", 1), _count(where, values, "h", 1)
-        frame_index = _count(where, mapping_field(where, entry), "frame_index", 0)
-        if frame_count is not None and frame_index >= frame_count:
-            raise InputError(
-                f"{where}.frame_index: expected at most {frame_count - 1}, the clip's last frame, "
-                f"found {frame_index}"
-            )
         K = _intrinsics(where, values, width, height)
-        cameras.append(RenderCamera(frame_index, _viewmat(where, entry), K, width, height))
+        cameras.append(PlacedCamera(where, entry, _viewmat(where, entry), K, width, height))
     return cameras
 
 

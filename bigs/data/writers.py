@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.arctic import DEFAULT_VIEW, MM_PER_M, ArcticView
+from bigs.data.base import Clip
 from bigs.data.fields import read_json
 from bigs.data.ho3d import CV_FROM_GL, SPLITS
 
@@ -133,6 +134,96 @@ def write_ho3d(
     with (Path(root) / f"{split}.txt").open("a") as listing:
         listing.writelines(f"{clip}/{stem}\n" for stem in stems)
     return folder
+
+
+def write_colmap(folder: str | Path, clip: Clip) -> Path:
+    """Write a clip with estimates as a COLMAP model in text form, with frames, masks and hands.npz beside.
+
+    See `bigs.data.sfm_folder` for the files. The model's unit is that of the clip's structure from motion.
+
+    Args:
+        folder: where to; made if missing.
+        clip: its world must be the camera, and it must have an object and masks.
+
+    Returns:
+        `folder`.
+    """
+    folder, (rotations, transl, points) = _sfm_frames(folder, clip)
+    place = folder / "sparse" / "0"
+    place.mkdir(parents=True, exist_ok=True)
+    K = clip.K
+    lens = " ".join(map(repr, [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]))
+    (place / "cameras.txt").write_text(f"1 PINHOLE {clip.width} {clip.height} {lens}\n")
+    # Quaternions are w first there; the second line of an image, its points, is empty.
+    quats = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
+    (place / "images.txt").write_text(
+        "".join(
+            f"{t + 1} {' '.join(map(repr, [*quats[t].tolist(), *transl[t].tolist()]))} 1 {path.name}\n\n"
+            for t, path in enumerate(clip.image_paths)
+        )
+    )
+    colors = _byte_colors(clip)
+    (place / "points3D.txt").write_text(
+        "".join(
+            f"{i + 1} {' '.join(map(repr, point))} {' '.join(map(str, colors[i]))} 0.5\n"
+            for i, point in enumerate(points.tolist())
+        )
+    )
+    return folder
+
+
+def write_nerfstudio(folder: str | Path, clip: Clip) -> Path:
+    """Write a clip with estimates as nerfstudio has it; for the arguments see `write_colmap`."""
+    folder, (rotations, transl, points) = _sfm_frames(folder, clip)
+    viewmats = np.repeat(np.eye(4)[None], len(clip), axis=0)
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = rotations, transl
+    document = {
+        "camera_model": "OPENCV",
+        "w": clip.width,
+        "h": clip.height,
+        "fl_x": float(clip.K[0, 0]),
+        "fl_y": float(clip.K[1, 1]),
+        "cx": float(clip.K[0, 2]),
+        "cy": float(clip.K[1, 2]),
+        "ply_file_path": "sparse_pc.ply",
+        "frames": [
+            {
+                "file_path": f"images/{path.name}",
+                "transform_matrix": (np.linalg.inv(viewmat) @ CV_FROM_GL).tolist(),
+            }
+            for path, viewmat in zip(clip.image_paths, viewmats, strict=True)
+        ],
+    }
+    (folder / "transforms.json").write_text(json.dumps(document))
+    trimesh.PointCloud(points, colors=_byte_colors(clip)).export(folder / "sparse_pc.ply")
+    return folder
+
+
+def _sfm_frames(folder: str | Path, clip: Clip) -> tuple[Path, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """What both kinds share: frames, masks and hands; and the object's poses and points in their own unit."""
+    folder, track = Path(folder), clip.object
+    if track is None or not np.allclose(clip.cam_from_world, np.eye(4)):
+        raise InputError(f"{clip.folder}: expected an object in the camera's own frame, found another clip")
+    for part, read in (("images", clip.image), ("masks", clip.mask)):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+        for t, path in enumerate(clip.image_paths):
+            Image.fromarray(read(t)).save(folder / part / f"{path.stem}.png")
+    fields = {
+        f"{side}_{key}": getattr(hand, key)
+        for side, hand in clip.hands.items()
+        for key in ("global_orient", "hand_pose", "transl", "betas", "valid")
+    }
+    np.savez(folder / "hands.npz", object_scale=track.scale, **fields)
+    own = track.metric_from_canon / np.array([[track.scale]] * 3 + [[1.0]])
+    points = track.points @ own[:3, :3].T + own[:3, 3]
+    return folder, (track.rotations, track.transl / track.scale, points)
+
+
+def _byte_colors(clip: Clip) -> np.ndarray:
+    track = clip.object
+    if track is None or track.colors is None:
+        return np.full((0 if track is None else len(track.points), 3), 128, dtype=np.uint8)
+    return (255 * track.colors).round().astype(np.uint8)
 
 
 def _write_object(target: ArcticView, truth: ObjectTruth) -> None:
