@@ -80,7 +80,7 @@ def load_parts(
 
     Args:
         model: a folder as diffusers saves it, or a model's name on the Hugging Face hub ("owner/name").
-        controlnet: likewise, for the ControlNet.
+        controlnet: likewise, for the ControlNet; or a pipeline's folder that has one.
         device: "auto" takes a GPU if there is one.
         precision: "auto" is float16 on a GPU and float32 on a CPU, which takes nothing else. The VAE has
             float32 always.
@@ -93,10 +93,12 @@ def load_parts(
     with _quiet():
         _check_source(model, "Stable Diffusion", {name: files for name, (_, files) in COMPONENTS.items()})
         if controlnet is not None:
-            _check_source(controlnet, "a ControlNet", {"": ("config.json",)})
+            inner = _controlnet_folder(controlnet)
         found = {name: _load(model, name, kind, name) for name, (kind, _) in COMPONENTS.items()}
-        found["controlnet"] = controlnet and _load(controlnet, "controlnet", "diffusers.ControlNetModel", "")
-    parts = Parts(**found)
+        control = None
+        if controlnet is not None:
+            control = _load(controlnet, "controlnet", "diffusers.ControlNetModel", inner)
+    parts = Parts(**found, controlnet=control)
     _check_fit(parts, model, controlnet)
     with _quiet():
         for network in parts.networks:
@@ -165,8 +167,18 @@ def _check_source(source: str, what: str, components: dict[str, tuple[str, ...]]
         )
     for name, files in components.items():
         if not any((folder / name / file).is_file() for file in files):
-            missing = f"component {name} ({name}/{files[0]})" if name else files[0]
-            raise InputError(f"{source}: expected {what} as diffusers saves it, found no {missing}")
+            raise InputError(
+                f"{source}: expected {what} as diffusers saves it, found no component {name} "
+                f"({name}/{files[0]})"
+            )
+
+
+def _controlnet_folder(source: str) -> str:
+    """Where in `source` the ControlNet is: at its top, or in the folder that pipelines have for it."""
+    if (Path(source) / "config.json").is_file():
+        return ""
+    _check_source(source, "a ControlNet", {"controlnet": ("config.json",)})
+    return "controlnet" if Path(source).is_dir() else ""
 
 
 def _load(source: str, name: str, kind: str, subfolder: str) -> Any:
@@ -174,6 +186,9 @@ def _load(source: str, name: str, kind: str, subfolder: str) -> Any:
     options: dict[str, Any] = {"subfolder": subfolder, "local_files_only": local}
     if name in _NETWORKS:
         options |= {"use_safetensors": True, "output_loading_info": True}
+        stored = [file.name for file in (Path(source) / subfolder).glob("*.safetensors")]
+        if local and stored and all(".fp16" in name for name in stored):
+            options["variant"] = "fp16"
     try:
         loaded = reader.from_pretrained(source, **options)
     except Exception as error:  # the libraries promise no particular exception for damaged files

@@ -169,8 +169,44 @@ def test_components_of_different_models_are_refused(
             load_parts(str(copy), device="cpu")
 
 
+def test_a_pipelines_own_controlnet_is_found(copy: Path, tiny_controlnet: Path) -> None:
+    shutil.copytree(tiny_controlnet, copy / "controlnet")
+    assert load_parts(str(copy), device="cpu").controlnet is None
+    found = load_parts(str(copy), controlnet=str(copy), device="cpu").controlnet.state_dict()
+    assert all(torch.equal(found[k], v) for k, v in load_file(weights_file(tiny_controlnet)).items())
+
+
+def test_weights_stored_in_half_precision_only(copy: Path) -> None:
+    parts = load_parts(str(copy), device="cpu")
+    for name in ("unet", "vae", "text_encoder"):
+        weights_file(copy / name).unlink()
+        getattr(parts, name).half().save_pretrained(copy / name, variant="fp16")
+        assert ".fp16." in weights_file(copy / name).name
+    again = load_parts(str(copy), device="cpu")
+    assert again.unet.dtype == torch.float32
+    for name in ("unet", "vae", "text_encoder"):
+        old, new = getattr(parts, name).state_dict(), getattr(again, name).state_dict()
+        assert all(torch.equal(old[key].float(), value.float()) for key, value in new.items())
+
+
+@pytest.mark.parametrize(
+    "sampler", ["PNDMScheduler", "EulerDiscreteScheduler", "DPMSolverMultistepScheduler"]
+)
+def test_the_noise_schedule_of_any_sampler_is_read(copy: Path, sampler: str) -> None:
+    import diffusers
+
+    made = getattr(diffusers, sampler)(
+        beta_start=0.001, beta_end=0.02, beta_schedule="linear", prediction_type="v_prediction"
+    )
+    made.save_pretrained(copy / "scheduler")
+    found = load_parts(str(copy), device="cpu").scheduler
+    expected = torch.cumprod(1.0 - torch.linspace(0.001, 0.02, 1000), 0)
+    torch.testing.assert_close(found.alphas_cumprod, expected)
+    assert found.config.prediction_type == "v_prediction"
+
+
 def test_a_controlnet_that_is_none_is_named(tiny_model: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"expected a ControlNet .* found no config\.json"):
+    with pytest.raises(InputError, match=r"expected a ControlNet .* found no component controlnet"):
         load_parts(str(tiny_model), controlnet=str(tmp_path), device="cpu")
 
 

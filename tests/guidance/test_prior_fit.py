@@ -182,7 +182,7 @@ def test_a_state_of_other_work_is_refused(fit: Callable[..., FittedToken], tmp_p
         ({"--out": "token.bin"}, ["token.bin", "ends in .safetensors", "found .bin"]),
         ({"--out": "nowhere/token.safetensors"}, ["nowhere", "expected a folder"]),
         ({"--model": "nowhere at all"}, ["nowhere at all", "expected a folder", "found neither"]),
-        ({"--controlnet": "."}, [".: expected a ControlNet", "found no config.json"]),
+        ({"--controlnet": "."}, [".: expected a ControlNet", "found no component controlnet"]),
         ({"--edge-weights": "x.pth"}, ["--edge-weights", "expected --controlnet", "found none"]),
         ({"--object": ""}, ["object name", "found none"]),
         ({"--token": "a b"}, ["token", "one word", "'a b'"]),
