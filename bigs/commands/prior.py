@@ -84,7 +84,7 @@ def fit_token(
     if edge_weights is not None and controlnet is None:
         raise InputError("--edge-weights: expected --controlnet, which looks at the edges, found none")
     clip = open_clip(clip_path, load_hand_models(None))
-    frames = choose_frames(clip.mask_areas["object"], _MOST_FRAMES)
+    frames = choose_frames(str(clip_path), clip.mask_areas["object"], _MOST_FRAMES)
     edges = edge_detector(edge_weights)
     parts = load_parts(
         model, controlnet=controlnet, device=device, precision=precision, attention_slicing=attention_slicing

@@ -24,8 +24,13 @@ class Crop(NamedTuple):
     mask: Tensor  # [1, S, S] uint8, 255 on the object
 
 
-def choose_frames(areas: np.ndarray, most: int) -> list[int]:
-    """Up to `most` frames, spread evenly over those whose masks [T] (pixels) show enough of the object.
+def choose_frames(where: str, areas: np.ndarray, most: int) -> list[int]:
+    """Up to `most` frames, spread evenly over those that show enough of the object.
+
+    Args:
+        where: what to call the clip in messages.
+        areas: of the object's masks, [T] pixels.
+        most: how many.
 
     Raises:
         InputError: no frame does.
@@ -33,7 +38,7 @@ def choose_frames(areas: np.ndarray, most: int) -> list[int]:
     shown = np.flatnonzero(areas >= max(_LEAST_PIXELS, _LEAST_SHARE * areas.max(initial=0)))
     if not len(shown):
         raise InputError(
-            f"object masks: expected a frame with at least {_LEAST_PIXELS} pixels of the object, "
+            f"{where}: masks: expected a frame with at least {_LEAST_PIXELS} pixels of the object, "
             f"found at most {int(areas.max(initial=0))}"
         )
     picks = np.linspace(0, len(shown) - 1, min(most, len(shown))).round().astype(int)

@@ -21,10 +21,10 @@ def frame(top: int, left: int, height: int, width: int) -> tuple[np.ndarray, np.
 
 def test_frames_are_spread_over_those_that_show_the_object() -> None:
     areas = np.array([0, 900, 1000, 10, 240, 260, 1000, 800])
-    assert choose_frames(areas, 64) == [1, 2, 5, 6, 7]
-    assert choose_frames(areas, 3) == [1, 5, 7]
-    with pytest.raises(InputError, match=r"expected a frame .* found at most 63"):
-        choose_frames(np.array([63, 0]), 8)
+    assert choose_frames("CLIP", areas, 64) == [1, 2, 5, 6, 7]
+    assert choose_frames("CLIP", areas, 3) == [1, 5, 7]
+    with pytest.raises(InputError, match=r"CLIP: masks: expected a frame .* found at most 63"):
+        choose_frames("CLIP", np.array([63, 0]), 8)
 
 
 def test_a_crop_is_a_square_around_the_object() -> None:

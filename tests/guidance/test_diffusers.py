@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_diffusion import SIZE, write_model
+from tiny_diffusion import SIZE, as_pipeline, write_model
 from torch import Tensor
 
 from bigs.checks import InputError
@@ -240,17 +240,13 @@ def test_tokens_survive_the_file_and_reach_the_text_encoder(parts: Parts, tmp_pa
 
 
 def test_the_library_reads_our_token_file(tiny_model: Path, tmp_path: Path) -> None:
-    from diffusers import StableDiffusionPipeline
-
-    write_token(tmp_path / "token.safetensors", Token("<it>", torch.arange(16.0)[None]))
-    loaded = vars(load_parts(str(tiny_model), device="cpu"))
-    loaded.pop("controlnet")
-    pipeline = StableDiffusionPipeline(
-        **loaded, safety_checker=None, feature_extractor=None, requires_safety_checker=False
-    )
+    write_token(tmp_path / "token.safetensors", Token("<it>", torch.arange(32.0).reshape(2, 16)))
+    pipeline = as_pipeline(load_parts(str(tiny_model), device="cpu"))
     pipeline.load_textual_inversion(str(tmp_path / "token.safetensors"))
-    row = pipeline.tokenizer.convert_tokens_to_ids("<it>")
-    assert pipeline.text_encoder.get_input_embeddings().weight[row].tolist() == list(range(16))
+    words = pipeline.maybe_convert_prompt("<it>", pipeline.tokenizer)
+    rows = pipeline.tokenizer(words, add_special_tokens=False).input_ids
+    weights = pipeline.text_encoder.get_input_embeddings().weight
+    assert weights[rows].flatten().tolist() == list(range(32))
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,14 @@ import torch
 from command_line import Answer, assert_refused
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from tiny_diffusion import as_pipeline
 
 from bigs.cli import prior as cli
 from bigs.commands import prior as command
 from bigs.commands.prior import FittedToken, fit_token
 from bigs.data.base import Clip
 from bigs.guidance import diffusers_folder
+from bigs.guidance.diffusers_folder import load_parts
 from bigs.guidance.inversion import InversionConfig
 
 CONFIG = InversionConfig("bottle", steps=4, batch=1)
@@ -47,7 +49,11 @@ def short(tiny_clip: Path, tiny_model: Path, tmp_path: Path) -> list[str | Path]
 
 
 def test_a_word_is_learned_and_written(
-    call: Callable[..., Answer], short: list[str | Path], tiny_controlnet: Path, tmp_path: Path
+    call: Callable[..., Answer],
+    short: list[str | Path],
+    tiny_model: Path,
+    tiny_controlnet: Path,
+    tmp_path: Path,
 ) -> None:
     answer = call(*short, "--controlnet", tiny_controlnet, "--token", "<it>")
     assert answer.code == 0, answer.err
@@ -57,7 +63,11 @@ def test_a_word_is_learned_and_written(
     assert [path.name for path in tmp_path.iterdir()] == ["token.safetensors"]
     found = load_file(tmp_path / "token.safetensors")
     assert list(found) == ["<it>"]
-    assert found["<it>"].shape == (1, 16)
+    # Another program's reader.
+    pipeline = as_pipeline(load_parts(str(tiny_model), device="cpu"))
+    pipeline.load_textual_inversion(str(tmp_path / "token.safetensors"))
+    row = pipeline.tokenizer.convert_tokens_to_ids("<it>")
+    assert torch.equal(pipeline.text_encoder.get_input_embeddings().weight[row], found["<it>"][0])
 
 
 class _Killed(Exception):

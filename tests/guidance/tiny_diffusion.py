@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 
+from bigs.guidance.diffusers_folder import Parts
+
 # Rows and columns of its pictures: 16 latents of two pixels.
 SIZE = 32
 
@@ -72,6 +74,16 @@ def write_controlnet(folder: Path, *, seed: int = 1) -> Path:
                 weights.normal_(std=0.1)
     network.save_pretrained(folder)
     return folder
+
+
+def as_pipeline(parts: Parts) -> Any:
+    """The library's own pipeline of a model's parts."""
+    from diffusers import StableDiffusionPipeline
+
+    components = {name: part for name, part in vars(parts).items() if name != "controlnet"}
+    return StableDiffusionPipeline(
+        **components, safety_checker=None, feature_extractor=None, requires_safety_checker=False
+    )
 
 
 def _unet_sizes() -> dict[str, Any]:
