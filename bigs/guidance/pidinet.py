@@ -65,53 +65,68 @@ def load_pidinet(path: Path) -> PiDiNet:
         InputError: the file is missing or unreadable, or a layer is missing or of another shape.
     """
     found = {name.removeprefix("module."): value for name, value in load_weights(path, "PiDiNet").items()}
-    weights: dict[str, Tensor] = {}
-
-    def take(name: str, *shape: int | None) -> int:
-        """Keep a tensor; returns its first axis, which is the number of channels that a layer makes."""
-        if name not in found:
-            raise InputError(f"{path}: expected PiDiNet as its authors name it, found no {name}")
-        weights[name] = checked_weight(f"{path}: {name}", found[name], shape)
-        return len(weights[name])
-
-    converted = found.get("block1_2.conv1.weight", torch.empty(0)).shape[-1:] == (5,)
-
-    def take_kernel(name: str, layer: int, *shape: int | None) -> int:
-        kind = _KINDS[layer % len(_KINDS)]
-        side = 5 if converted and kind == "radial" else 3
-        made = take(name, *shape, side, side)
-        if not converted:
-            weights[name] = ordinary_kernel(weights[name], kind)
-        return made
-
-    width = channels = take_kernel("init_block.weight", 0, None, 3)
+    layers = _Layers(path, found)
+    width = channels = layers.take_kernel("init_block.weight", 0, None, 3)
     layer = 1
     for scale, blocks in enumerate(_BLOCKS):
         out = width * min(2**scale, 4)
         for block in range(1, blocks + 1):
             name = f"block{scale + 1}_{block}"
-            take_kernel(f"{name}.conv1.weight", layer, channels, 1)
-            take(f"{name}.conv2.weight", out, channels, 1, 1)
+            layers.take_kernel(f"{name}.conv1.weight", layer, channels, 1)
+            layers.take(f"{name}.conv2.weight", out, channels, 1, 1)
             if scale > 0 and block == 1:
-                take(f"{name}.shortcut.weight", out, channels, 1, 1)
-                take(f"{name}.shortcut.bias", out)
+                layers.take(f"{name}.shortcut.weight", out, channels, 1, 1)
+                layers.take(f"{name}.shortcut.bias", out)
             channels = out
             layer += 1
-        read = channels
-        if any(name.startswith(f"dilations.{scale}.") for name in found):
-            read = take(f"dilations.{scale}.conv1.weight", None, channels, 1, 1)
-            take(f"dilations.{scale}.conv1.bias", read)
+        layers.take_head(scale, channels)
+    layers.take("classifier.weight", 1, len(_BLOCKS), 1, 1)
+    layers.take("classifier.bias", 1)
+    return PiDiNet(layers.weights)
+
+
+class _Layers:
+    """The layers of a file, checked one by one as the network is walked through."""
+
+    def __init__(self, path: Path, found: dict[str, Tensor]) -> None:
+        self._path, self._found = path, found
+        # Only the radial kernels show which kind of file it is.
+        self._converted = found.get("block1_2.conv1.weight", torch.empty(0)).shape[-1:] == (5,)
+        self.weights: dict[str, Tensor] = {}
+
+    def take(self, name: str, *shape: int | None) -> int:
+        """Keep a tensor; returns its first axis, which is the number of channels that a layer makes."""
+        if name not in self._found:
+            raise InputError(f"{self._path}: expected PiDiNet as its authors name it, found no {name}")
+        self.weights[name] = checked_weight(f"{self._path}: {name}", self._found[name], shape)
+        return len(self.weights[name])
+
+    def take_kernel(self, name: str, layer: int, *shape: int | None) -> int:
+        """Likewise, for the kernel [*shape, k, k] of one of the 16 layers that may take differences."""
+        kind = _KINDS[layer % len(_KINDS)]
+        side = 5 if self._converted and kind == "radial" else 3
+        made = self.take(name, *shape, side, side)
+        if not self._converted:
+            self.weights[name] = ordinary_kernel(self.weights[name], kind)
+        return made
+
+    def take_head(self, scale: int, channels: int) -> None:
+        """Keep what makes edges of the features of one scale."""
+        context, attention = f"dilations.{scale}", f"attentions.{scale}"
+        if any(name.startswith(f"{context}.") for name in self._found):
+            channels = self._take_biased(f"{context}.conv1", channels)
             for index in range(len(_DILATIONS)):
-                take(f"dilations.{scale}.conv2_{index + 1}.weight", read, read, 3, 3)
-        if any(name.startswith(f"attentions.{scale}.") for name in found):
-            inner = take(f"attentions.{scale}.conv1.weight", None, read, 1, 1)
-            take(f"attentions.{scale}.conv1.bias", inner)
-            take(f"attentions.{scale}.conv2.weight", 1, inner, 3, 3)
-        take(f"conv_reduces.{scale}.conv.weight", 1, read, 1, 1)
-        take(f"conv_reduces.{scale}.conv.bias", 1)
-    take("classifier.weight", 1, len(_BLOCKS), 1, 1)
-    take("classifier.bias", 1)
-    return PiDiNet(weights)
+                self.take(f"{context}.conv2_{index + 1}.weight", channels, channels, 3, 3)
+        if any(name.startswith(f"{attention}.") for name in self._found):
+            inner = self._take_biased(f"{attention}.conv1", channels)
+            self.take(f"{attention}.conv2.weight", 1, inner, 3, 3)
+        self.take(f"conv_reduces.{scale}.conv.weight", 1, channels, 1, 1)
+        self.take(f"conv_reduces.{scale}.conv.bias", 1)
+
+    def _take_biased(self, name: str, channels: int) -> int:
+        made = self.take(f"{name}.weight", None, channels, 1, 1)
+        self.take(f"{name}.bias", made)
+        return made
 
 
 def ordinary_kernel(kernel: Tensor, kind: str) -> Tensor:

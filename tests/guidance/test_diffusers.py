@@ -104,6 +104,39 @@ def test_the_controlnet_sees_the_edges_and_its_scale_counts(controlled: Parts) -
         StableDiffusion(controlled, PROMPTS).predict(noisy, timesteps, conditions(FRONT))
 
 
+def test_the_librarys_own_pipeline_takes_the_same_step(controlled: Parts) -> None:
+    """Prompts, guidance and ControlNet together, against code that is not ours."""
+    from diffusers import StableDiffusionControlNetPipeline
+
+    pipeline = StableDiffusionControlNetPipeline(
+        **vars(controlled), safety_checker=None, feature_extractor=None, requires_safety_checker=False
+    )
+    pipeline.set_progress_bar_config(disable=True)
+    noisy, edges = random_latents(1), soft_edges(pictures())
+    taken: dict[str, Tensor] = {}
+
+    def keep(_pipeline: Any, _step: int, timestep: Tensor, values: dict[str, Tensor]) -> dict[str, Tensor]:
+        taken.update(timestep=timestep, latents=values["latents"])
+        return values
+
+    pipeline(
+        "a mug, side view",
+        image=edges.expand(-1, 3, -1, -1),
+        negative_prompt="bad",
+        num_inference_steps=1,
+        guidance_scale=7.5,
+        controlnet_conditioning_scale=0.7,
+        latents=noisy,
+        output_type="latent",
+        callback_on_step_end=keep,
+    )
+    prior = StableDiffusion(controlled, PROMPTS, guidance_scale=7.5, conditioning_scale=0.7)
+    asked = conditions(math.pi / 2)._replace(edges=edges)
+    noise = prior.predict(noisy, taken["timestep"][None], asked)
+    ours = controlled.scheduler.step(noise, taken["timestep"], noisy).prev_sample
+    torch.testing.assert_close(ours, taken["latents"], rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_every_kind_of_network_gives_the_noise(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
