@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import io
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from command_line import Run
 from PIL import Image
 
-from bigs.export.challenge import load_challenge
+from bigs.checks import InputError
+from bigs.commands.run_folder import load_run
+from bigs.data.hold import load_hold
+from bigs.export.submission import check_submission
+from bigs.hand import load_hand_models
+from bigs.train.initial import initial_trajectory
+from bigs.types import Side
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -36,7 +46,15 @@ def pixels(path: Path) -> np.ndarray:
 
 def test_every_example_has_a_test_a_purpose_and_a_main() -> None:
     names = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert names == {"render_gaussians", "fit_image", "pose_hand", "reconstruct_arctic", "gsplat_script"}
+    assert names == {
+        "render_gaussians",
+        "fit_image",
+        "pose_hand",
+        "gsplat_script",
+        "reconstruct_arctic",
+        "reconstruct_ho3d",
+        "novel_pose",
+    }
     for name in names:
         tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
         assert "Key ideas:" in (ast.get_docstring(tree) or "")
@@ -85,15 +103,62 @@ def test_pose_hand(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_reconstruct_arctic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    submission = load("reconstruct_arctic").main(tmp_path / "arctic", frames=12)
-    assert submission.name == "synthetic_bottle_0.pt"
-    predicted = load_challenge(submission)
-    assert set(predicted.joints) == {"right", "left"} and predicted.object_verts is not None
-    assert len(predicted.frame_names) == 12
-    rows = {line.split("  ")[0]: line for line in capsys.readouterr().out.splitlines()}
-    assert "is complete: 12 frames" in next(iter(rows))
-    mpjpe = rows["MPJPE, mean of hands"].removesuffix(" %").split()
-    assert float(mpjpe[-1]) < -10.0
+    example = load("reconstruct_arctic")
+    archive = example.main(tmp_path / "arctic", frames=8)
+    (clip,) = check_submission(archive, [example.STAND_IN])
+    assert clip.frames == 8
+    rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    assert "8 frames submitted" in " ".join(rows[f"{example.STAND_IN}: 8 frames submitted"])
+    assert rows["paper: HOLD"][2:] == ["105.92", "123.54", "2.07", "63.92", "27.13", "24.70"]
+    # Called again it keeps its run and packs the same zip.
+    before = archive.read_bytes()
+    example.main(tmp_path / "arctic", frames=8)
+    with zipfile.ZipFile(io.BytesIO(before)) as old, zipfile.ZipFile(archive) as new:
+        assert [i.CRC for i in old.infolist()] == [i.CRC for i in new.infolist()]
+
+
+def test_reconstruct_arctic_says_what_it_needs(tmp_path: Path) -> None:
+    example = load("reconstruct_arctic")
+    assert example.path_of("arctic_s03_box_grab_01_1") == Path("s03/box_grab_01/1")
+    with pytest.raises(InputError, match="expected names as arctic_s05_box_grab_01_1, found box"):
+        example.path_of("box")
+    with pytest.raises(InputError, match="expected the challenge's clip, or ARCTIC's release"):
+        example.main(tmp_path / "out", data=tmp_path)
+
+
+@pytest.mark.slow
+def test_reconstruct_ho3d(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scores = load("reconstruct_ho3d").main(tmp_path / "ho3d", frames=16, view="limited")
+    text = capsys.readouterr().out
+    assert "limited: directions within" in text and "limited view: BIGS" in text
+    assert "mpjpe_ra_l" not in scores and 0 < scores["mpjpe_ra_r"] < 40
+    assert len(load_hold(tmp_path / "ho3d" / "clips" / "SYN1_limited")) == 4
+    assert "SYN1_limited" in (tmp_path / "ho3d" / "comparison.md").read_text()
+
+
+@pytest.mark.slow
+def test_novel_pose(tmp_path: Path, finished_run: Run, tiny_clip: Path) -> None:
+    """A run that follows its own clip stays near its own poses; its own clip backwards does not."""
+    example = load("novel_pose")
+    after = example.main(tmp_path, run=finished_run.folder, motion=tiny_clip)
+    before = load_run(finished_run.folder)
+    for side in ("right", "left"):
+        moved = (after.hands[side].joints - before.hands[side].joints).norm(dim=-1).mean()
+        crossed = (after.hands[side].joints - before.hands[side].joints.flip(0)).norm(dim=-1).mean()
+        assert moved < 0.06 and moved < 0.5 * crossed
+        error = torch.linalg.vector_norm(
+            after.hands[side].joints[:, 0] - initial_wrists(tiny_clip, side), dim=-1
+        )
+        assert error.median() < 0.02
+    assert len(list(tmp_path.glob("[0-9]*.png"))) == len(before)
+    upper, lower = np.split(pixels(tmp_path / "strip.png"), 2, axis=0)
+    assert 0.01 < np.abs(upper - lower).mean() < 0.2
+    assert 0.05 < (lower < 0.95).any(axis=-1).mean() < 0.8
+
+
+def initial_wrists(clip: Path, side: Side) -> torch.Tensor:
+    """Where the clip's estimates have a wrist, [T, 3] in the camera."""
+    return torch.from_numpy(initial_trajectory(load_hold(clip), load_hand_models(None)).joints[side][:, 0])
 
 
 def test_an_example_is_a_program(tmp_path: Path) -> None:

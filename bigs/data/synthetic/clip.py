@@ -50,6 +50,7 @@ def make_clip(
     seed: int = 0,
     hands: Sequence[Side] = SIDES,
     object: ObjectKind = "bottle",
+    name: str | None = None,
 ) -> Path:
     """Write a clip in the layout of HOLD's `build` folder, with `gt.npz` and `gt_object.ply` beside it.
 
@@ -61,6 +62,7 @@ def make_clip(
         seed: the clip is a function of it and of the other arguments.
         hands: which hands hold the object.
         object: what they hold.
+        name: of the sequence; made of object and seed if not given.
 
     Returns:
         `folder`.
@@ -108,7 +110,7 @@ def make_clip(
     object_track, shift = _object_track(object_guess, np.clip(colors, 0, 1))
     write_hold(
         folder,
-        name=f"synthetic_{object}_{seed}",
+        name=name or f"synthetic_{object}_{seed}",
         frame_names=[f"{t:05d}.png" for t in range(frames)],
         images=[(p.image * 255).round().astype(np.uint8) for p in pictures],
         masks=[p.mask for p in pictures],
