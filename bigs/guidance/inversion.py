@@ -52,6 +52,8 @@ class InversionConfig:
         for name in ("steps", "batch"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, found {getattr(self, name)}")
+        if not self.conditioning_scale >= 0.0:
+            raise InputError(f"conditioning_scale: expected 0 or more, found {self.conditioning_scale}")
         if not self.lr > 0.0:
             raise InputError(f"lr: expected more than 0, found {self.lr}")
 

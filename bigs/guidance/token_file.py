@@ -72,7 +72,7 @@ def new_words(parts: Parts, words: list[str]) -> list[int]:
     """Add words to the tokenizer and rows for them to the text encoder; returns which rows.
 
     Raises:
-        InputError: the tokenizer knows one of them already.
+        InputError: the tokenizer knows one of them already, or cannot tell it from others.
     """
     known = parts.tokenizer.get_vocab()
     for word in words:
@@ -85,4 +85,9 @@ def new_words(parts: Parts, words: list[str]) -> list[int]:
     parts.text_encoder.resize_token_embeddings(rows, mean_resizing=False)
     parts.text_encoder.requires_grad_(False)
     found: list[int] = parts.tokenizer.convert_tokens_to_ids(words)
+    for word, row in zip(words, found, strict=True):
+        if parts.tokenizer(word, add_special_tokens=False).input_ids != [row]:
+            raise InputError(
+                f"token {word}: expected a word that the tokenizer keeps whole, found it is split"
+            )
     return found

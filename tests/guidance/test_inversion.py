@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,12 +177,20 @@ def test_a_gradient_that_is_not_finite_stops_the_work(parts: Parts, monkeypatch:
         ({"token": "two words"}, "token: expected one word .* 'two words'"),
         ({"steps": 0}, "steps: expected at least 1, found 0"),
         ({"batch": 0}, "batch: expected at least 1, found 0"),
+        ({"conditioning_scale": -0.1}, "conditioning_scale: expected 0 or more, found -0.1"),
         ({"lr": 0.0}, "lr: expected more than 0, found 0.0"),
     ],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         InversionConfig(**{"object_name": "mug", **settings})
+
+
+@pytest.mark.parametrize("token", ["<Mug>", "mein-Becher", "käfer", "sks1"])
+def test_words_of_any_spelling_stay_whole(parts: Parts, token: str) -> None:
+    Inversion(parts, replace(CONFIG, token=token))
+    plain, asked = (parts.tokenizer(f"a photo of a {word} mug").input_ids for word in ("", token))
+    assert len(asked) == len(plain) + 1
 
 
 def test_pictures_have_the_models_size(parts: Parts) -> None:
