@@ -123,15 +123,27 @@ def frames(
     _run(_request(out, source, VideoOptions(frames=options), None, redo), ("frames",))
 
 
-def masks(clip: Clip, options: Annotated[MaskOptions, Flat] = MaskOptions(), redo: bool = False) -> None:
+def masks(
+    clip: Clip,
+    options: Annotated[MaskOptions, Flat] = MaskOptions(),
+    keypoints: Path | None = None,
+    redo: bool = False,
+    threads: int = 0,
+) -> None:
     """The second step: label images of right hand, left hand and object.
 
     Args:
         clip: the clip folder.
         options: where the masks come from.
+        keypoints: JSON file of the hands' keypoints, which stand in for clicks on the hands with --sam2.
         redo: make it anew though it is up to date.
+        threads: CPU threads; 0 takes all.
     """
-    _run(_request(clip, None, VideoOptions(masks=options), None, redo), ("masks",))
+    use_threads(threads)
+    if keypoints is not None and options.sam2 is None:
+        raise InputError("--keypoints: expected --sam2 with it, found none")
+    chosen = VideoOptions(masks=options, hands=HandOptions(keypoints=keypoints))
+    _run(_request(clip, None, chosen, None, redo), ("masks",))
 
 
 def hands(

@@ -47,6 +47,10 @@ def preprocess(
         if name in steps:
             listen(name)
             began = time.perf_counter()
-            outcome = RUN[name](request, lambda text, step=name: listen(f"{step}: {text}"))  # type: ignore[misc]
+            outcome = RUN[name](request, _under_name(name, listen))
             outcomes.append(outcome._replace(seconds=time.perf_counter() - began))
     return outcomes
+
+
+def _under_name(name: str, listen: Callable[[str], None]) -> Callable[[str], None]:
+    return lambda text: listen(f"{name}: {text}")

@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw
 
-from bigs.data.base import Clip, HandTrack
+from bigs.data.base import Clip
 from bigs.data.images import read_image
-from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
 from bigs.hand.model import MANO_PARENTS
+from bigs.preprocess.hands import joints_of_track
 from bigs.types import MASK_VALUES, SIDES, Entity, Side
 from bigs.viewer.preview import contact_sheet, save_picture
 
@@ -67,20 +66,6 @@ def tinted(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return mixed.round().astype(np.uint8)
 
 
-@torch.no_grad()
-def joints_of(track: HandTrack, model: HandModel, cam_from_world: np.ndarray | None = None) -> np.ndarray:
-    """The 21 joints [T, 21, 3] of a track in the camera frame, metres."""
-    orient, pose, betas, transl = (
-        torch.as_tensor(array, dtype=torch.float32)
-        for array in (track.global_orient, track.hand_pose, track.betas, track.transl)
-    )
-    wrist = model.rest_joints(betas)[0] + transl
-    out = model(betas, model.pose_matrices(pose), axis_angle_to_matrix(orient), wrist).joints.double().numpy()
-    if cam_from_world is None:
-        return out
-    return np.einsum("tij,tnj->tni", cam_from_world[:, :3, :3], out) + cam_from_world[:, None, :3, 3]
-
-
 def with_skeletons(
     image: np.ndarray, joints: Mapping[Side, np.ndarray], valid: Mapping[Side, bool], K: np.ndarray
 ) -> np.ndarray:
@@ -117,12 +102,11 @@ def with_points(image: np.ndarray, points: np.ndarray, K: np.ndarray, valid: boo
 def draw_clip(clip: Clip, hand_models: Mapping[Side, HandModel]) -> Callable[[int, np.ndarray], np.ndarray]:
     """Draws what a finished clip says of each frame: hands and object where the estimates put them."""
     sides = [side for side in SIDES if side in clip.hands]
-    joints = {side: joints_of(clip.hands[side], hand_models[side], clip.cam_from_world) for side in sides}
+    to_cam = clip.cam_from_world
+    joints = {side: _moved(to_cam, joints_of_track(clip.hands[side], hand_models[side])) for side in sides}
     points = None
     if clip.object is not None:
-        world = clip.object.points_world()
-        to_cam = clip.cam_from_world
-        points = np.einsum("tij,tnj->tni", to_cam[:, :3, :3], world) + to_cam[:, None, :3, 3]
+        points = _moved(to_cam, clip.object.points_world())
 
     def draw(t: int, image: np.ndarray) -> np.ndarray:
         marked = image
@@ -132,3 +116,8 @@ def draw_clip(clip: Clip, hand_models: Mapping[Side, HandModel]) -> Callable[[in
         return with_skeletons(marked, {side: joints[side][t] for side in sides}, valid, clip.K)
 
     return draw
+
+
+def _moved(to_cam: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points [T, N, 3] under rigid motions [T, 4, 4]."""
+    return np.einsum("tij,tnj->tni", to_cam[:, :3, :3], points) + to_cam[:, None, :3, 3]

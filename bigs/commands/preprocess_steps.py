@@ -10,20 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.commands.preprocess_pictures import draw_clip, joints_of, tinted, with_skeletons, write_sheet
-from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
+from bigs.commands.preprocess_pictures import draw_clip, tinted, with_skeletons, write_sheet
+from bigs.commands.preprocess_request import PreprocessRequest, StepName, StepOutcome
 from bigs.data.base import HandTrack
 from bigs.data.hold import load_hold
 from bigs.data.images import read_image, read_mask
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.artefacts import (
     ALIGNED_FILE,
+    FRAMES,
     FRAMES_FILE,
     HANDS_FILE,
     MASKS,
     MASKS_FILE,
     SFM_FILE,
     FrameSet,
+    State,
     content_digest,
     frame_paths,
     mask_paths,
@@ -35,12 +37,17 @@ from bigs.preprocess.artefacts import (
     write_json,
 )
 from bigs.preprocess.build import write_build
+from bigs.preprocess.clicks import add_hand_clicks, read_clicks
 from bigs.preprocess.frames import extract_frames, frame_inputs
+from bigs.preprocess.hand_dumps import read_hand_dump
 from bigs.preprocess.hand_fit import HandFitConfig
-from bigs.preprocess.hands import HandEstimates, fit_hands
-from bigs.preprocess.keypoints import read_keypoints
+from bigs.preprocess.hand_import import import_hands
+from bigs.preprocess.hands import HandEstimates, fit_hands, joints_of_track
+from bigs.preprocess.keypoints import read_keypoints, write_keypoints
+from bigs.preprocess.landmarker import find_keypoints
 from bigs.preprocess.mask_checks import check_masks
-from bigs.preprocess.masks import open_masks, write_masks
+from bigs.preprocess.masks import MaskSource, open_masks, write_masks
+from bigs.preprocess.sam2 import load_sam2, no_weights, segment_clip
 from bigs.preprocess.source import open_source
 from bigs.preprocess.words import frame_ranges
 from bigs.types import Side
@@ -78,27 +85,19 @@ def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     processed = request.processed
     frames = read_frame_set(processed)
     file, picture = processed / MASKS_FILE, processed / "masks.png"
-    given = request.masks
-    if given is None and not file.exists() and (processed / MASKS).is_dir():
-        return _adopt_masks(processed, frames, picture)
-    if given is None:
-        if not file.exists():
-            raise InputError(
-                f"{processed / MASKS}: expected masks of hands and object, found none; give --masks DIR, "
-                "or --sam2 DIR with --clicks FILE"
-            )
-        mask_paths(processed, frames)
-        return StepOutcome("masks", "supplied", "as they are", _stored_notes(file), None)
-    if not given.is_dir():
-        raise InputError(
-            f"{given}: expected a folder of masks, found {'a file' if given.exists() else 'nothing'}"
-        )
-    inputs = content_digest(given, request.mask_labels, _frame_identity(frames))
+    if request.masks is None and request.sam2 is None:
+        if request.mask_labels or request.clicks is not None:
+            raise InputError("--mask-labels, --clicks: expected --masks or --sam2 with them, found neither")
+        return _supplied_masks(processed, frames, picture)
+    if request.masks is not None:
+        inputs, label_source = _given_masks(request, frames)
+    else:
+        inputs, label_source = _sam2_masks(request, frames, listen)
     state = request.state(file, inputs)
     if state in ("current", "supplied"):
         mask_paths(processed, frames)
         return _kept("masks", state, "as they are", picture, _stored_notes(file))
-    source = open_masks(given, frames, request.mask_labels)
+    source = label_source()
     found: list[str] = []
 
     def check(masks: list[np.ndarray], twice: list[int]) -> list[str]:
@@ -111,34 +110,52 @@ def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
 
 
 def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
-    """`hands.npz` from keypoints."""
+    """`hands.npz` from keypoints, a detector, or another hand estimator."""
     processed = request.processed
     frames = read_frame_set(processed)
     file, picture = processed / HANDS_FILE, processed / "hands.png"
-    if request.keypoints is None:
-        if not file.exists():
-            raise InputError(
-                f"{file}: expected estimates of the hands, found none; give --keypoints FILE (21 points "
-                f"of each "
-                "hand), or --hands FILE of another hand estimator"
-            )
-        hands = read_hands(file, len(frames.names))
-        return StepOutcome("hands", "supplied", _hands_summary(hands), (), None)
+    sources = {
+        "--keypoints": request.keypoints,
+        "--hands": request.hands,
+        "--landmarker": request.landmarker,
+    }
+    given = [name for name, value in sources.items() if value is not None]
+    if len(given) > 1:
+        raise InputError(f"hands: expected one of {', '.join(sources)}, found {' and '.join(given)}")
+    if not given:
+        return _supplied_hands(file, len(frames.names))
+    source = sources[given[0]]
+    if source is None or not source.exists():
+        raise InputError(f"{source}: expected a file for {given[0]}, found nothing")
     config = HandFitConfig()
-    masks = processed / MASKS
     inputs = content_digest(
-        request.keypoints, _frame_identity(frames), frames.K, masks, _model_identity(request), asdict(config)
+        given[0],
+        source,
+        _frame_identity(frames),
+        frames.K,
+        processed / MASKS,
+        _model_identity(request),
+        asdict(config),
     )
     state = request.state(file, inputs)
     if state in ("current", "supplied"):
         return _kept("hands", state, _hands_summary(read_hands(file, len(frames.names))), picture)
     models = load_hand_models(request.hand_model)
-    keypoints = read_keypoints(request.keypoints, frames)
     labels = None
     if (processed / MASKS_FILE).exists():
         labels = [read_mask(path) for path in mask_paths(processed, frames)]
-    listen("fitting")
-    found = fit_hands(keypoints, frames.K, models, fps=frames.fps, masks=labels, config=config)
+    if given == ["--hands"]:
+        means = {side: model.hands_mean.double().numpy() for side, model in models.items()}
+        listen("reading")
+        found = import_hands(read_hand_dump(source, frames, means), frames.K, models, labels)
+    else:
+        if given == ["--landmarker"]:
+            keypoints = find_keypoints(source, frame_paths(processed, frames), frames.fps, listen)
+            write_keypoints(processed / "keypoints.json", keypoints, frames)
+        else:
+            keypoints = read_keypoints(source, frames)
+        listen("fitting")
+        found = fit_hands(keypoints, frames.K, models, fps=frames.fps, masks=labels, config=config)
     write_hands(file, found.tracks, inputs)
     _draw_hands(picture, processed, frames, found, models)
     return StepOutcome("hands", "made", _hands_summary(found.tracks), found.notes, picture)
@@ -176,6 +193,71 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     return StepOutcome("build", "made", str(build), (), picture)
 
 
+def _supplied_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:
+    """Masks of an earlier run, or that another tool put in their place: looked at, and kept as they are."""
+    file = processed / MASKS_FILE
+    if file.exists():
+        mask_paths(processed, frames)
+        return StepOutcome("masks", "supplied", "as they are", _stored_notes(file), None)
+    if not (processed / MASKS).is_dir():
+        raise InputError(
+            f"{processed / MASKS}: expected masks of hands and object, found none; give --masks DIR, "
+            "or --sam2 DIR with --clicks FILE"
+        )
+    return _adopt_masks(processed, frames, picture)
+
+
+def _given_masks(request: PreprocessRequest, frames: FrameSet) -> tuple[str, Callable[[], MaskSource]]:
+    """Digest and maker of the masks of a folder."""
+    folder = request.masks
+    if request.sam2 is not None or request.clicks is not None:
+        raise InputError("masks: expected --masks, or --sam2 with --clicks, found both")
+    if folder is None or not folder.is_dir():
+        found = "a file" if folder is not None and folder.exists() else "nothing"
+        raise InputError(f"{folder}: expected a folder of masks, found {found}")
+    inputs = content_digest(folder, request.mask_labels, _frame_identity(frames))
+    return inputs, lambda: open_masks(folder, frames, request.mask_labels)
+
+
+def _sam2_masks(
+    request: PreprocessRequest, frames: FrameSet, listen: Listen
+) -> tuple[str, Callable[[], MaskSource]]:
+    """Digest and maker of the masks that SAM 2 makes of clicks and, for hands without, of keypoints."""
+    folder, processed = request.sam2, request.processed
+    if request.mask_labels:
+        raise InputError("--mask-labels: expected --masks with it, found --sam2")
+    if folder is None or not folder.is_dir():
+        raise InputError(no_weights(folder))
+    if request.clicks is None:
+        raise InputError("--sam2: expected --clicks FILE with a click or a box on the object, found none")
+    clicks = read_clicks(request.clicks, frames)
+    if request.keypoints is not None:
+        clicks = add_hand_clicks(clicks, read_keypoints(request.keypoints, frames), frames)
+    if "object" not in clicks:
+        raise InputError(
+            f"{request.clicks}: expected a click or a box on the object, found {', '.join(clicks)}"
+        )
+    parts = [folder, request.clicks, processed / FRAMES_FILE, processed / FRAMES]
+    inputs = content_digest(*parts, *([request.keypoints] if request.keypoints else []))
+
+    def make() -> MaskSource:
+        listen("loading SAM 2")
+        size = (frames.width, frames.height)
+        masks = segment_clip(load_sam2(folder), frame_paths(processed, frames), size, clicks, listen)
+        return MaskSource(lambda t: (masks[t], 0), f"SAM 2, clicks on {', '.join(clicks)}")
+
+    return inputs, make
+
+
+def _supplied_hands(file: Path, frames: int) -> StepOutcome:
+    if not file.exists():
+        raise InputError(
+            f"{file}: expected estimates of the hands, found none; give --keypoints FILE (21 points of each "
+            "hand), or --hands FILE of another hand estimator"
+        )
+    return StepOutcome("hands", "supplied", _hands_summary(read_hands(file, frames)), (), None)
+
+
 def _adopt_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:
     """Masks that another tool put in their place: looked at, and kept as they are."""
     masks = [read_mask(path, (frames.width, frames.height)) for path in mask_paths(processed, frames)]
@@ -185,12 +267,15 @@ def _adopt_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcom
     return StepOutcome("masks", "supplied", "as they are", notes, picture)
 
 
-def _kept(name: str, state: str, summary: str, picture: Path, notes: tuple[str, ...] = ()) -> StepOutcome:
+def _kept(
+    name: StepName, state: State, summary: str, picture: Path, notes: tuple[str, ...] = ()
+) -> StepOutcome:
     """A step that has nothing to do."""
+    shown = picture if picture.exists() else None
     if state == "supplied":
         notes = (*notes, "kept as another tool supplied it; remove it, or pass --redo, to have it made")
-    shown = picture if picture.exists() else None
-    return StepOutcome(name, "supplied" if state == "supplied" else "up to date", summary, notes, shown)  # type: ignore[arg-type]
+        return StepOutcome(name, "supplied", summary, notes, shown)
+    return StepOutcome(name, "up to date", summary, notes, shown)
 
 
 def _frame_identity(frames: FrameSet) -> dict[str, object]:
@@ -234,7 +319,7 @@ def _draw_masks(picture: Path, processed: Path, frames: FrameSet, masks: list[np
 def _draw_hands(
     picture: Path, processed: Path, frames: FrameSet, found: HandEstimates, models: dict[Side, HandModel]
 ) -> None:
-    joints = {side: joints_of(track, models[side]) for side, track in found.tracks.items()}
+    joints = {side: joints_of_track(track, models[side]) for side, track in found.tracks.items()}
 
     def draw(t: int, image: np.ndarray) -> np.ndarray:
         valid = {side: bool(track.valid[t]) for side, track in found.tracks.items()}

@@ -6,8 +6,6 @@ Both hands are fitted as right hands at once; the left one is seen in a mirror. 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bigs.geometry.rotations import axis_angle_to_matrix
+from bigs.preprocess.adam import minimise
 from bigs.preprocess.hand_guess import guess_poses, likeliest_sequence
 from bigs.preprocess.skeleton import HandPoses, HandSkeleton
 
@@ -130,7 +129,7 @@ def _improve(
         fit = _misfit(skeleton.joints(betas, *current), target, weight, sigma, config.outlier)
         return fit + 0.5 * skeleton.unlikeliness(current.angles)
 
-    _minimise(lambda: energies().sum(), variables.groups(config.rate), config.candidate_steps)
+    minimise(lambda: energies().sum(), variables.groups(config.rate), config.candidate_steps)
     with torch.no_grad():
         improved = HandPoses(*(part.unflatten(0, (-1, count)) for part in variables.poses()))
         return improved, energies().unflatten(0, (-1, count))
@@ -198,7 +197,7 @@ def _refine(
         return loss
 
     groups = [*variables.groups(config.rate), {"params": [betas], "lr": config.rate}]
-    _minimise(total, groups, config.steps)
+    minimise(total, groups, config.steps)
     with torch.no_grad():
         poses = variables.poses()
         joints = skeleton.joints(betas, *poses)
@@ -231,19 +230,6 @@ class _Variables:
         depth = self.log_depth.exp()
         wrist = torch.cat([self.ray * depth, depth], dim=-1)
         return HandPoses(self.angles, self.base @ axis_angle_to_matrix(self.turn), wrist)
-
-
-def _minimise(loss: Callable[[], Tensor], groups: list[dict[str, Any]], steps: int) -> None:
-    """Adam with a rate that falls to a twentieth along half a cosine."""
-    optimizer = torch.optim.Adam(groups, fused=True)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: 0.05 + 0.475 * (1.0 + math.cos(math.pi * step / steps))
-    )
-    for _ in range(steps):
-        optimizer.zero_grad(set_to_none=True)
-        loss().backward()
-        optimizer.step()
-        schedule.step()
 
 
 def _project(joints: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_choice
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.preprocess.artefacts import FrameSet
@@ -60,7 +61,7 @@ def read_keypoints(file: Path, frames: FrameSet) -> dict[Side, Keypoints]:
         entries = [(str(i), rows[i]) for i in match_count(f"{file}: frames", len(rows), frames)]
     else:
         raise InputError(f"{file}: frames: expected a list or a dictionary, found {type(rows).__name__}")
-    scale, shift = _pixels(file, stored, frames)
+    scale, shift = frame_pixels(file, stored, frames)
     found: dict[Side, Keypoints] = {}
     for side in SIDES:
         table = np.stack([_hand(f"{file}: frames.{name}.{side}", entry, side) for name, entry in entries])
@@ -76,16 +77,18 @@ def read_keypoints(file: Path, frames: FrameSet) -> dict[Side, Keypoints]:
     return found
 
 
-def write_keypoints(file: Path, keypoints: Mapping[Side, Keypoints], names: tuple[str, ...]) -> None:
+def write_keypoints(file: Path, keypoints: Mapping[Side, Keypoints], frames: FrameSet) -> None:
     """Write keypoints in the layout that `read_keypoints` reads, in MANO's order."""
     rows: dict[str, Any] = {}
-    for t, name in enumerate(names):
+    for t, name in enumerate(frames.names):
         rows[name] = {
             side: np.column_stack([hand.points[t], hand.confidence[t]]).round(3).tolist()
             for side, hand in keypoints.items()
             if hand.confidence[t].any()
         }
-    file.write_text(json.dumps({"order": "mano", "frames": rows}))
+    content = {"order": "mano", "width": frames.width, "height": frames.height, "frames": rows}
+    with atomic_write(file) as stream:
+        stream.write(json.dumps(content).encode())
 
 
 def _read(file: Path) -> Mapping[str, Any]:
@@ -97,7 +100,7 @@ def _read(file: Path) -> Mapping[str, Any]:
         raise InputError(f"{file}: expected JSON, found {error}") from None
 
 
-def _pixels(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> tuple[np.ndarray, float]:
+def frame_pixels(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> tuple[np.ndarray, float]:
     """The factor [2] and the shift that carry the file's coordinates to the frames' pixels."""
 
     def number(key: str, default: float) -> float:

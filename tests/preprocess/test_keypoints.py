@@ -76,7 +76,7 @@ def test_missing_joints_may_be_null_or_nan(tmp_path: Path) -> None:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     file = write(tmp_path, {"order": "openpose", "frames": [{"right": hand(OPENPOSE_X)}, {}]})
     first = read_keypoints(file, FRAME_SET)
-    write_keypoints(file, first, FRAME_SET.names)
+    write_keypoints(file, first, FRAME_SET)
     again = read_keypoints(file, FRAME_SET)
     assert np.array_equal(again["right"].points, first["right"].points)
 
