@@ -24,6 +24,9 @@ from bigs.cli.terminal import (
 if TYPE_CHECKING:
     from bigs.commands.reconstruct import Outcome
 
+# "auto", or the names of `train.config.PriorKind`; a test compares.
+Prior = Literal["auto", "off", "symmetry"]
+
 # The names of `commands.formats.FORMATS`; a test compares.
 Format = Literal[
     "ply",
@@ -85,6 +88,7 @@ def reconstruct(
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     perceptual_weights: tuple[Path, ...] = (),
+    prior: Prior = "auto",
     threads: int = 0,
     video: Annotated[VideoOptions, tyro.conf.arg(name="")] = NO_VIDEO,
 ) -> None:
@@ -104,6 +108,8 @@ def reconstruct(
         without: leave out one ingredient (share, smooth, contact, lighting, ...) or loss term; repeatable.
         perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
             "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
+        prior: what completes the object where no frame shows it: off, symmetry (if there is strong evidence
+            for one), or auto, which is what the preset says (symmetry in all but paper).
         threads: CPU threads; 0 takes all.
         video: what preprocessing needs, when the clip is a video or a folder of images.
     """
@@ -117,6 +123,8 @@ def reconstruct(
         files = tuple(str(path.resolve()) for path in perceptual_weights)
         settings = dataclasses.replace(settings, perceptual_weights=files)
     clip = clip_of(clip, out, video, hand_model)
+    if prior != "auto":
+        settings = dataclasses.replace(settings, prior=dataclasses.replace(settings.prior, kind=prior))
     with progress_listener(stderr, settings) as listen:
         outcome = run(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen
@@ -250,6 +258,8 @@ def ablate(
 
 
 def show(outcome: Outcome) -> None:
+    for name, text in outcome.report.facts.items():
+        say(f"{name}: {text}")
     for line in outcome.report.skipped:
         say(f"skipped: {line}")
     for line in outcome.report.retreats:

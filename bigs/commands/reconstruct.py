@@ -193,6 +193,7 @@ def _write_preview(
             "frames": f"{len(clip)}, {clip.width} x {clip.height}",
             "subjects": ", ".join(playback.entities),
             "Gaussians": str(playback.gaussians([0]).means.shape[1]),
+            **report.facts,
         },
         pictures={"input, render, render over input, turned": sheet},
         video=video,

@@ -49,7 +49,7 @@ class ObjectViews:
 def times_seen(
     views: ObjectViews, points: np.ndarray, normals: np.ndarray, surface: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """In how many frames [N] surface points show: they face the camera, and neither object nor hand hides them.
+    """In how many frames [N] surface points show: they face the camera, and nothing hides them.
 
     Args:
         views: the clip's frames.

@@ -1,10 +1,11 @@
-"""Triangle meshes: normals, midpoint subdivision as a linear map, spacing of points."""
+"""Triangle meshes: normals, samples, midpoint subdivision as a linear map, spacing of points."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
 import scipy.spatial
+import trimesh
 
 
 def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -22,6 +23,13 @@ def face_areas(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = verts[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.linalg.norm(cross, axis=-1)
+
+
+def sample_surface(verts: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """About `count` evenly spread surface points [N, 3] and their unit outward normals [N, 3]."""
+    mesh = trimesh.Trimesh(verts, faces, process=False)
+    points, face = trimesh.sample.sample_surface_even(mesh, count, seed=0)
+    return np.asarray(points), np.asarray(mesh.face_normals[face])
 
 
 def midpoint_subdivision(faces: np.ndarray, n_verts: int) -> tuple[scipy.sparse.csr_matrix, np.ndarray]:

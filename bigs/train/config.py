@@ -8,6 +8,7 @@ from typing import Literal
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.raster.settings import RasterSettings
+from bigs.train.completion import CompletionConfig
 from bigs.train.initial import InitialConfig
 
 Step = Literal["single-subject", "interacting-subjects"]
@@ -82,6 +83,18 @@ class SplitStage:
     least_opacity: float = 0.05
 
 
+# What is believed of the object's parts that no frame shows.
+PriorKind = Literal["off", "symmetry"]
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """What completes the object where it was never seen."""
+
+    kind: PriorKind = "off"
+    completion: CompletionConfig = field(default_factory=CompletionConfig)
+
+
 Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage
 
 
@@ -98,6 +111,7 @@ class RunConfig:
     lighting: bool = True
     # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
+    prior: PriorConfig = field(default_factory=PriorConfig)
     # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
     perceptual_weights: tuple[str, ...] = ()
     stages: tuple[Stage, ...] = ()

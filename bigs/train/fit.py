@@ -48,6 +48,7 @@ class FitReport:
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
+    facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
     # Seconds of the interrupted runs that this one continues; they count in `seconds`, too.
     before: float = 0.0
 
@@ -86,10 +87,17 @@ def fit(
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene, notes = build_scene(
-        clip, unknown, hand_models, config.initial, config.hand, config.object, config.lighting
+    scene, skipped, report.facts = build_scene(
+        clip,
+        unknown,
+        hand_models,
+        config.initial,
+        config.hand,
+        config.object,
+        config.lighting,
+        None if config.prior.kind == "off" else config.prior.completion,
     )
-    report.skipped += [network_note, *notes] if network_note else notes
+    report.skipped += [network_note, *skipped] if network_note else skipped
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None

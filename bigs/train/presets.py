@@ -7,7 +7,7 @@ from dataclasses import replace
 from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage
+from bigs.train.config import GraspStage, OptimizeStage, PriorConfig, RunConfig, ScaleSearchStage, SplitStage
 from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
@@ -160,6 +160,7 @@ _OBJECT_DETAIL = OptimizeStage(
 )
 
 FAST = RunConfig(
+    prior=PriorConfig("symmetry"),
     stages=(
         _HANDS_COARSE,
         _HANDS_FINE,
@@ -173,7 +174,7 @@ FAST = RunConfig(
         replace(_JOINT, steps=180),
         SplitStage(),
         _OBJECT_DETAIL,
-    )
+    ),
 )
 
 # For a little clip, in well under two minutes on two cores.

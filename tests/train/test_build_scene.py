@@ -14,10 +14,11 @@ from scipy.spatial import cKDTree
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_ground_truth
+from bigs.geometry.mesh import sample_surface
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.raster import rasterization
-from bigs.train.build import build_scene, sample_surface
+from bigs.train.build import build_scene
 from bigs.train.initial import initial_trajectory
 from bigs.train.presets import SMOKE
 from bigs.types import MASK_VALUES, SIDES, Entity, Side
@@ -28,7 +29,8 @@ AS_GIVEN = replace(SMOKE.initial, smooth_hands=0.0, smooth_object=0.0)
 def build(clip: Clip, hands: dict[Side, HandModel]) -> tuple[Scene, list[str]]:
     torch.manual_seed(0)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
-    return build_scene(clip, nothing, hands, AS_GIVEN, SMOKE.hand, SMOKE.object, True)
+    scene, skipped, _ = build_scene(clip, nothing, hands, AS_GIVEN, SMOKE.hand, SMOKE.object, True)
+    return scene, skipped
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,9 @@ def test_groups_partition_the_parameters_of_any_clip(
     if case == "two canonical hands":
         hand = replace(hand, shared=False)
     unknown = torch.zeros(len(tiny), tiny.height, tiny.width, dtype=torch.bool).numpy()
-    scene, _ = build_scene(tiny, unknown, both_hands, SMOKE.initial, hand, SMOKE.object, case != "no light")
+    scene = build_scene(
+        tiny, unknown, both_hands, SMOKE.initial, hand, SMOKE.object, case != "no light"
+    ).scene
     assert_partition(scene)
     assert len(scene.hand_splats) == (2 if case == "two canonical hands" else 1)
 

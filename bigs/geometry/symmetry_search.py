@@ -1,0 +1,248 @@
+"""The search for an object's symmetries: candidates that samples vote for, refined and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+import scipy.spatial
+
+from bigs.geometry.coverage import sphere_directions
+from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+
+# Candidates that are refined, those of them that are polished, rounds of refinement, and samples that vote.
+_FINALISTS = 14
+_POLISHED = 4
+_ROUNDS = 6
+_VOTERS = 400
+# Cosine of 35 degrees.
+_LEAST_COSINE = 0.82
+# No more symmetries than these are looked for: three planes fill every octant.
+_MOST = 3
+
+
+@dataclass(frozen=True)
+class SymmetryConfig:
+    """When a symmetry counts as found. Lengths are shares of the object's longest side.
+
+    On six clips that show a third of their object, true mirror planes had shares of 0.72 to 0.97, and no
+    false one that was sharp had more than 0.66.
+    """
+
+    # A carried point meets seen surface when it is as near as this, with a normal within 35 degrees.
+    tolerance: float = 0.02
+    # Share of the carried points that must meet seen surface.
+    least_support: float = 0.12
+    # And of those that say anything: the others contradict the clip.
+    least_share: float = 0.75
+    # Share that may contradict.
+    most_contradiction: float = 0.06
+    # Share that must fall where nobody looked: a symmetry that adds nothing is of no use.
+    least_new: float = 0.05
+    # The colours that meet must be nearer to each other than this share of what chance would make them.
+    most_color_error: float = 0.85
+    # How much worse, in support less three times the contradictions, a shift by 1.5 tolerances or a turn by 5
+    # degrees must be.
+    least_sharpness: float = 0.03
+
+
+def find_symmetries(
+    surface: SeenSurface, is_empty: IsEmpty, config: SymmetryConfig = SymmetryConfig()
+) -> list[Symmetry]:
+    """The symmetries for which the evidence is strong, in the order in which they were found; often none.
+
+    After each one the search begins anew on the surface that it completes: what was seen of one side of a box
+    says nothing about its back, what two sides say together does.
+
+    Args:
+        surface: what was seen, at least a few hundred samples.
+        is_empty: see `IsEmpty`.
+        config: what counts as strong.
+    """
+    found: list[Symmetry] = []
+    while len(found) < _MOST and len(surface.points) >= 100:
+        judge = _Judge(surface, is_empty, config)
+        # An axis completes more than any plane, and only a body of revolution passes for one.
+        best = None if found else judge.best(_axis_candidates(surface), found)
+        best = best or judge.best(_plane_candidates(surface), found)
+        if best is None:
+            break
+        found.append(best)
+        surface = completed(surface, [best], is_empty, judge.tolerance)
+    return found
+
+
+class _Judge:
+    """Scores symmetries against what was seen."""
+
+    def __init__(self, surface: SeenSurface, is_empty: IsEmpty, config: SymmetryConfig) -> None:
+        self.surface = surface
+        self.is_empty = is_empty
+        self.config = config
+        self.size = float(np.ptp(surface.points, axis=0).max())
+        self.tolerance = config.tolerance * self.size
+        self.tree = scipy.spatial.cKDTree(surface.points)
+        middle = np.median(surface.colors, axis=0)
+        # Of two colours drawn at random from the surface; never so small that noise decides.
+        self.chance = max(1.4 * float(np.abs(surface.colors - middle).mean()), 0.02)
+
+    def images(self, symmetry: Symmetry) -> list[SeenSurface]:
+        """What is carried; of the many turns about an axis every eighth sample will do."""
+        every = 8 if symmetry.kind == "axis" else 1
+        return symmetry.images(SeenSurface(*(values[::every] for values in self.surface)))
+
+    def matches(self, image: SeenSurface, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Which carried points meet seen surface within `reach`, and which points they meet: indices [M]."""
+        distance, index = self.tree.query(image.points, distance_upper_bound=reach)
+        near = np.flatnonzero(np.isfinite(distance))
+        same_way = (image.normals[near] * self.surface.normals[index[near]]).sum(-1) > _LEAST_COSINE
+        return near[same_way], index[near[same_way]]
+
+    def evidence(self, symmetry: Symmetry) -> tuple[float, float, float]:
+        """Support and contradiction as shares of what is carried; the colours' error relative to chance."""
+        support, contradiction, errors = [], [], []
+        for image in self.images(symmetry):
+            carried, met = self.matches(image, self.tolerance)
+            rest = np.ones(len(image.points), dtype=bool)
+            rest[carried] = False
+            support.append(len(carried) / len(rest))
+            contradiction.append(self.is_empty(image.points[rest]).sum() / len(rest))
+            errors.append(np.abs(image.colors[carried] - self.surface.colors[met]).mean(-1))
+        error = np.concatenate(errors)
+        color = float(error.mean()) / self.chance if len(error) else np.inf
+        return float(np.mean(support)), float(np.mean(contradiction)), color
+
+    def worth(self, symmetry: Symmetry) -> float:
+        support, contradiction, _ = self.evidence(symmetry)
+        return support - 3.0 * contradiction
+
+    def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
+        """The candidate, refined, for which most speaks; None if that is not enough."""
+        ranked = sorted(candidates, key=self.worth, reverse=True)[:_FINALISTS]
+        refined: list[Symmetry] = []
+        for symmetry in sorted(map(self._refined, ranked), key=self.worth, reverse=True):
+            if not any(_alike(symmetry, other, self.size) for other in (*known, *refined)):
+                refined.append(symmetry)
+        for symmetry in sorted(map(self._polished, refined[:_POLISHED]), key=self.worth, reverse=True):
+            support, contradiction, color = self.evidence(symmetry)
+            if (
+                not any(_alike(symmetry, other, self.size) for other in known)
+                and support + contradiction <= 1.0 - self.config.least_new
+                and support >= self.config.least_support
+                and contradiction <= self.config.most_contradiction
+                and support >= self.config.least_share * (support + contradiction)
+                and color <= self.config.most_color_error
+                and self._sharpness(symmetry) >= self.config.least_sharpness
+            ):
+                return replace(symmetry, support=support, contradiction=contradiction)
+        return None
+
+    def _refined(self, symmetry: Symmetry) -> Symmetry:
+        """The symmetry moved to where the carried points lie on the planes of those they meet."""
+        for reach in np.geomspace(4.0, 1.5, _ROUNDS) * self.tolerance:
+            pairs = [self.matches(image, reach) for image in self.images(symmetry)]
+            if sum(len(carried) for carried, _ in pairs) < 30:
+                break
+            start = symmetry
+
+            def off_plane(x: np.ndarray, start: Symmetry = start, pairs: list = pairs) -> np.ndarray:
+                return np.concatenate(
+                    [
+                        ((image.points[carried] - self.surface.points[met]) * self.surface.normals[met]).sum(
+                            -1
+                        )
+                        for image, (carried, met) in zip(
+                            self.images(start.moved(x, self.size)), pairs, strict=True
+                        )
+                    ]
+                )
+
+            step = scipy.optimize.least_squares(
+                off_plane, np.zeros(4), loss="soft_l1", f_scale=0.5 * self.tolerance, max_nfev=4
+            )
+            symmetry = start.moved(step.x, self.size)
+        return symmetry
+
+    def _polished(self, symmetry: Symmetry) -> Symmetry:
+        """The symmetry moved a little to where most speaks for it."""
+        simplex = np.vstack([np.zeros(4), np.diag([0.02, 0.02, 0.06, 0.06])])
+        found = scipy.optimize.minimize(
+            lambda x: -self.worth(symmetry.moved(x, self.size)),
+            np.zeros(4),
+            method="Nelder-Mead",
+            options={"maxfev": 60, "initial_simplex": simplex},
+        )
+        return symmetry.moved(found.x, self.size)
+
+    def _sharpness(self, symmetry: Symmetry) -> float:
+        """How much worse the least bad of some small moves is."""
+        shift, turn = 1.5 * self.config.tolerance, np.radians(5.0)
+        moves = [(0.0, shift, 0.0, 0.0), (0.0, 0.0, turn, 0.0), (0.0, 0.0, 0.0, turn)]
+        if symmetry.kind == "axis":
+            moves.append((shift, 0.0, 0.0, 0.0))
+        tried = [symmetry.moved(sign * np.array(move), self.size) for move in moves for sign in (1.0, -1.0)]
+        return self.worth(symmetry) - max(map(self.worth, tried))
+
+
+def _alike(a: Symmetry, b: Symmetry, size: float) -> bool:
+    return (
+        a.kind == b.kind
+        and abs(a.direction @ b.direction) > np.cos(np.radians(12.0))
+        and abs((a.point - b.point) @ a.direction) < 0.08 * size
+    )
+
+
+def _plane_candidates(surface: SeenSurface) -> list[Symmetry]:
+    """Planes that many pairs of samples are mirrored by, and all directions through the box's middle."""
+    rng = np.random.default_rng(0)
+    chosen = rng.permutation(len(surface.points))[:_VOTERS]
+    p, n, c = surface.points[chosen], surface.normals[chosen], surface.colors[chosen]
+    first, second = np.triu_indices(len(p), 1)
+    between = p[first] - p[second]
+    length = np.linalg.norm(between, axis=-1)
+    size = np.ptp(p, axis=0).max()
+    direction = between / np.maximum(length, 1e-9)[:, None]
+    mirrored = n[first] - 2.0 * (n[first] * direction).sum(-1, keepdims=True) * direction
+    good = (length > 0.15 * size) & ((mirrored * n[second]).sum(-1) > 0.94)
+    # A pair whose normals are the same and at right angles to what joins them is mirrored by chance as well.
+    good &= np.abs((n[first] * direction).sum(-1)) > 0.2
+    good &= np.abs(c[first] - c[second]).mean(-1) < 0.15
+    direction = direction[good]
+    offset = (0.5 * (p[first[good]] + p[second[good]]) * direction).sum(-1)
+    bins = sphere_directions(400)
+    bins = bins[bins[:, 2] >= 0.0]
+    cosine = direction @ bins.T
+    nearest = np.abs(cosine).argmax(1)
+    offset = offset * np.sign(cosine[np.arange(len(cosine)), nearest])
+    step = 0.03 * size
+    cells, votes = np.unique(
+        np.stack([nearest, np.rint(offset / step).astype(int)], axis=-1), axis=0, return_counts=True
+    )
+    best = cells[np.argsort(-votes, kind="stable")[:60]]
+    planes = [Symmetry("plane", step * cell * bins[which], bins[which]) for which, cell in best]
+    middle = 0.5 * (surface.points.min(0) + surface.points.max(0))
+    return planes + [Symmetry("plane", middle, axis) for axis in bins[::4]]
+
+
+def _axis_candidates(surface: SeenSurface) -> list[Symmetry]:
+    """Lines that the normals of many samples meet.
+
+    The normals of a surface of revolution meet its axis: Pottmann and Randrup, "Rotational and helical
+    surface approximation for reverse engineering" (1998).
+    """
+    rng = np.random.default_rng(0)
+    size = np.ptp(surface.points, axis=0).max()
+    middle = surface.points.mean(0)
+    points = (surface.points - middle) / size
+    # A line (direction, moment) meets a normal where their product is zero.
+    moments = np.concatenate([np.cross(points, surface.normals), surface.normals], axis=-1)
+    result = []
+    for _ in range(40):
+        chosen = rng.choice(len(moments), 40, replace=False)
+        direction, moment = np.linalg.svd(moments[chosen])[2][-1].reshape(2, 3)
+        length = np.linalg.norm(direction)
+        if length > 1e-3:
+            foot = np.cross(direction, moment) / length**2
+            result.append(Symmetry("axis", middle + size * foot, direction / length))
+    return result

@@ -1,0 +1,129 @@
+"""What a clip never showed of the object, by symmetry, where there is strong evidence for one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.ndimage
+import scipy.spatial
+
+from bigs.geometry.coverage import times_empty, times_seen
+from bigs.geometry.mesh import sample_surface
+from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
+from bigs.train.carving import Carving
+from bigs.train.initial import InitialConfig, ObjectStart
+
+
+@dataclass(frozen=True)
+class CompletionConfig:
+    """When parts that were never seen are completed by symmetry. Lengths in metres."""
+
+    symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
+    # Nothing is completed when this share of the surface was seen.
+    enough: float = 0.9
+    # A part counts as seen when it shows in so many frames; fewer may be a fault of mask or pose.
+    least_frames: int = 3
+    # Poses are wrong by about so much: nearer surface does not hide, and nothing is known to be empty nearer.
+    tolerance: float = 0.006
+    # Seen surface speaks for a symmetry only this near to a point: elsewhere it may be the hull's alone.
+    measured: float = 0.008
+    # A carried point is new when it is further than this from all others.
+    gap: float = 0.003
+
+
+@dataclass(frozen=True)
+class Completion:
+    """The object's surface with what was added to it."""
+
+    surface: DistanceGrid
+    seen: float  # share of the surface that the clip shows
+    symmetries: list[Symmetry]
+    points: np.ndarray  # [M, 3] the added points, metres
+    colors: np.ndarray  # [M, 3]
+    why_not: str = ""  # why nothing was added
+
+    def __str__(self) -> str:
+        if not self.symmetries:
+            return self.why_not
+        kinds = [symmetry.kind for symmetry in self.symmetries]
+        names = {"plane": "mirror plane", "axis": "axis of revolution"}
+        found = ", ".join(
+            f"{kinds.count(kind)} {name}{'s' if kinds.count(kind) > 1 else ''}"
+            for kind, name in names.items()
+            if kind in kinds
+        )
+        return f"{found} found, {len(self.points)} points added where nothing was seen"
+
+
+# Samples of the surface that are looked at, and those that may hide them.
+_SAMPLES, _OCCLUDERS = 4000, 20_000
+# Of that tolerance the hull, which three frames agree on, takes this share.
+_OUTSIDE = 0.67
+
+
+def seen_samples(
+    carving: Carving, surface: DistanceGrid, config: CompletionConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Even samples of a surface: points [N, 3], normals [N, 3], and which [N] the clip shows."""
+    verts, faces = extract_mesh(surface)
+    occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
+    points, normals = sample_surface(verts, faces, _SAMPLES)
+    frames = times_seen(carving.views, points, normals, occluders, config.tolerance)
+    return points, normals, frames >= min(config.least_frames, len(carving.views.shown))
+
+
+def complete(
+    carving: Carving, start: ObjectStart, initial: InitialConfig, config: CompletionConfig
+) -> Completion:
+    """The object's surface; where it was never seen, by its symmetries if it has any.
+
+    The search is a matter of seconds.
+    """
+    plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
+    points, normals, seen = seen_samples(carving, plain, config)
+    nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
+    if nothing.seen >= config.enough:
+        return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")
+    tree = scipy.spatial.cKDTree(start.points)
+    distance, nearest = tree.query(points)
+    measured = seen & (distance < config.measured)
+    colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
+    surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
+    is_empty = _empty_space(carving, surface, config)
+    symmetries = find_symmetries(surface, is_empty, config.symmetry)
+    if not symmetries:
+        return replace(nothing, why_not="no strong evidence for any")
+    known = SeenSurface(carving.points, carving.normals, colors[tree.query(carving.points)[1]])
+    whole = completed(known, symmetries, is_empty, config.gap)
+    # The points now stand all around the object, so nothing is beyond their convex hull.
+    grid = carving.closed(initial, whole.points, whole.normals, 0.0)
+    added = slice(len(known.points), None)
+    return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
+
+
+def with_points(start: ObjectStart, completion: Completion) -> ObjectStart:
+    """The start values with the added points and their colours."""
+    points = np.concatenate([start.points, completion.points])
+    colors = None if start.colors is None else np.concatenate([start.colors, completion.colors])
+    return start._replace(points=points, colors=colors)
+
+
+def _empty_space(carving: Carving, surface: SeenSurface, config: CompletionConfig) -> IsEmpty:
+    """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
+    grid = carving.hull
+    corners = grid.points()
+    outside = grid.values.ravel()
+    near = np.flatnonzero(outside < config.tolerance)
+    empty = np.ones(len(corners))
+    before = times_empty(carving.views, corners[near], surface.points, config.tolerance)
+    empty[near] = (outside[near] > _OUTSIDE * config.tolerance) | (before >= config.least_frames)
+    volume = empty.reshape(grid.values.shape)
+
+    def is_empty(points: np.ndarray) -> np.ndarray:
+        place = ((points - grid.origin) / grid.spacing).T
+        return scipy.ndimage.map_coordinates(volume, place, order=1, mode="constant", cval=1.0) > 0.5
+
+    return is_empty

@@ -1,0 +1,119 @@
+"""Symmetries of surfaces of which one side was seen, with the truth known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from bigs.geometry.mesh import sample_surface
+from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry_search import find_symmetries
+
+# Where the camera stands, as seen from the object: three faces of a box show.
+VIEW = np.array([0.5, 0.6, 0.4]) / np.linalg.norm([0.5, 0.6, 0.4])
+
+
+def seen_of(mesh: trimesh.Trimesh, color_axis: int = 2) -> tuple[SeenSurface, np.ndarray]:
+    """Samples that face the camera, coloured by height, with half a millimetre of noise; and all samples."""
+    points, normals = sample_surface(mesh.vertices, mesh.faces, 3000)
+    noisy = points + np.random.default_rng(0).normal(size=points.shape) * 5e-4
+    colors = np.abs(np.sin(40.0 * points[:, [color_axis]])) * [1.0, 0.5, 0.2]
+    shown = normals @ VIEW > 0.25
+    return SeenSurface(noisy[shown], normals[shown], colors[shown]), points
+
+
+def outside(mesh: trimesh.Trimesh) -> IsEmpty:
+    """What silhouettes all around would say: whatever is outside the convex hull is empty."""
+    hull = trimesh.convex.convex_hull(mesh)
+    origins, normals = hull.triangles_center, hull.face_normals
+    offsets = (origins * normals).sum(-1)
+    return lambda points: (points @ normals.T - offsets).max(-1) > 0.004
+
+
+def missing(points: np.ndarray, truth: np.ndarray) -> float:
+    """Share of the true samples without a point within 5 mm."""
+    return float((cKDTree(points).query(truth)[0] > 0.005).mean())
+
+
+@pytest.fixture(scope="module")
+def bottle() -> trimesh.Trimesh:
+    """A body of revolution about a tilted axis."""
+    outline = [[0, 0], [0.035, 0], [0.035, 0.1], [0.012, 0.13], [0.012, 0.16], [0, 0.16]]
+    mesh = trimesh.creation.revolve(outline, sections=64)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.3, [1, 0.2, 0]))
+    return mesh
+
+
+def test_planes_of_a_wedge_that_has_one() -> None:
+    """A wedge is mirrored by one plane only; that one is found, to a millimetre and two degrees."""
+    outline = np.array([[0.0, 0.0], [0.15, 0.0], [0.03, 0.09]])
+    wedge = trimesh.creation.extrude_triangulation(outline, np.array([[0, 1, 2]]), 0.08)
+    surface, truth = seen_of(wedge, color_axis=0)
+    found = find_symmetries(surface, outside(wedge))
+    assert {symmetry.kind for symmetry in found} == {"plane"}
+    assert abs(found[0].direction[2]) > np.cos(np.radians(2.0))
+    assert abs((found[0].point - [0, 0, 0.04]) @ found[0].direction) < 2e-3
+    before, after = (
+        missing(points, truth)
+        for points in (surface.points, completed(surface, found, outside(wedge), 0.003).points)
+    )
+    assert after < before - 0.1
+
+
+def test_a_body_of_revolution_is_completed(bottle: trimesh.Trimesh) -> None:
+    surface, truth = seen_of(bottle)
+    found = find_symmetries(surface, outside(bottle))
+    assert found
+    whole = completed(surface, found, outside(bottle), 0.003)
+    assert missing(surface.points, truth) > 0.4
+    assert missing(whole.points, truth) < 0.1
+    # What was added lies on the true surface, too.
+    added = whole.points[len(surface.points) :]
+    assert np.median(cKDTree(truth).query(added)[0]) < 0.003
+
+
+def test_an_axis_carries_by_turns() -> None:
+    axis = Symmetry("axis", np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    one = SeenSurface(np.array([[0.2, 0.0, 0.3]]), np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 3)))
+    images = axis.images(one)
+    assert len(images) == 11
+    for image in images:
+        np.testing.assert_allclose(np.hypot(image.points[0, 0] - 0.1, image.points[0, 1]), 0.1)
+        np.testing.assert_allclose(image.points[0, 2], 0.3)
+        np.testing.assert_allclose((image.points[0] - [0.1, 0, 0.3]) / 0.1, image.normals[0], atol=1e-12)
+
+
+def test_a_plane_twice_is_nothing() -> None:
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=3)
+    plane = Symmetry("plane", rng.normal(size=3), direction / np.linalg.norm(direction))
+    surface = SeenSurface(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.random((20, 3)))
+    (there,) = plane.images(surface)
+    (back,) = plane.images(there)
+    np.testing.assert_allclose(back.points, surface.points, atol=1e-12)
+    np.testing.assert_allclose(back.normals, surface.normals, atol=1e-12)
+
+
+def test_a_lump_has_no_symmetry() -> None:
+    """The convex hull of a few random points; nothing is completed on weak evidence."""
+    lump = trimesh.convex.convex_hull(0.08 * np.random.default_rng(3).normal(size=(9, 3)))
+    surface, _ = seen_of(lump)
+    assert find_symmetries(surface, outside(lump)) == []
+
+
+def test_colours_can_speak_against_a_plane() -> None:
+    """A box whose halves are of different colours is not mirrored onto itself across them."""
+    box = trimesh.creation.box((0.12, 0.06, 0.09))
+    surface, _ = seen_of(box)
+    plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
+    rng = np.random.default_rng(0)
+    mixed = surface._replace(colors=rng.random(surface.colors.shape))
+    assert find_symmetries(plain, outside(box))
+    assert find_symmetries(mixed, outside(box)) == []
+
+
+def test_too_little_was_seen() -> None:
+    few = SeenSurface(np.random.default_rng(0).normal(size=(50, 3)), np.eye(3)[[0] * 50], np.zeros((50, 3)))
+    assert find_symmetries(few, lambda points: np.zeros(len(points), dtype=bool)) == []

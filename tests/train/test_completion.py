@@ -1,0 +1,130 @@
+"""Completion by symmetry of clips that show one side of their object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from limited_view import limited_view
+
+from bigs.data.base import Clip
+from bigs.data.ground_truth import load_ground_truth
+from bigs.data.hold import load_hold
+from bigs.data.synthetic import make_clip
+from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.hand import HandModel
+from bigs.metrics.align import similarity_icp
+from bigs.metrics.shape import ShapeScore
+from bigs.train.build import build_scene
+from bigs.train.carving import Carving, carve
+from bigs.train.completion import Completion, CompletionConfig, complete
+from bigs.train.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
+from bigs.train.presets import SMOKE
+from bigs.types import HandObjectTrajectory, Side
+
+INITIAL = InitialConfig(surface_resolution=56)
+
+
+@pytest.fixture(scope="module")
+def bottle(
+    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
+) -> tuple[Clip, HandObjectTrajectory]:
+    """A whole turn of a bottle, and the truth."""
+    folder = tmp_path_factory.mktemp("bottle") / "clip"
+    path = make_clip(folder, hand_models=both_hands, frames=36, width=240, height=180, seed=2)
+    return load_hold(path), load_ground_truth(path)
+
+
+@pytest.fixture(scope="module")
+def one_side(bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, Carving, ObjectStart]:
+    clip = limited_view(*bottle, range(12))
+    start = smooth_object(object_in_camera(clip, INITIAL), 2.0)
+    return clip, carve(clip, nothing_hides(clip), start, INITIAL), start
+
+
+def nothing_hides(clip: Clip) -> np.ndarray:
+    return np.zeros((len(clip), clip.height, clip.width), dtype=bool)
+
+
+def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
+    verts, faces = extract_mesh(surface)
+    return similarity_icp(verts, truth.object_verts[0], faces, truth.object_faces).score
+
+
+@pytest.mark.slow
+def test_the_unseen_side_comes_nearer_to_the_truth(
+    one_side: tuple[Clip, Carving, ObjectStart], bottle: tuple[Clip, HandObjectTrajectory]
+) -> None:
+    _, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig())
+    assert found.seen < 0.7
+    assert found.symmetries and len(found.points) == len(found.colors) > 100
+    before = score(carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach), bottle[1])
+    after = score(found.surface, bottle[1])
+    assert after.chamfer.squared < 0.8 * before.chamfer.squared
+    assert after.f5 > before.f5 and after.f10 >= before.f10
+
+
+def test_weak_evidence_changes_nothing(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
+    _, carving, start = one_side
+    base = CompletionConfig()
+    strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
+    found = complete(carving, start, INITIAL, strict)
+    plain = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
+    assert "no strong evidence" in str(found)
+    np.testing.assert_array_equal(found.surface.values, plain.values)
+
+
+def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
+    _, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig(enough=0.05))
+    assert not found.symmetries and "of the object's surface was seen" in str(found)
+
+
+def test_a_scene_says_what_was_seen_and_completed(
+    one_side: tuple[Clip, Carving, ObjectStart],
+    both_hands: dict[Side, HandModel],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With completion the scene starts from the completed surface; without, from what it was before."""
+    clip, carving, _ = one_side
+    added = np.array([[0.0, 0.0, 0.3]])
+
+    def completed(*arguments: object) -> Completion:
+        values = carving.hull.values + 0.002
+        grid = DistanceGrid(values, carving.hull.origin, carving.hull.spacing)
+        return Completion(grid, 0.4321, [object()], added, np.ones((1, 3)))  # type: ignore[list-item]
+
+    monkeypatch.setattr("bigs.train.build.complete", completed)
+    monkeypatch.setattr("bigs.train.completion.Completion.__str__", lambda self: "as told")
+    built = [
+        build_scene(
+            clip, nothing_hides(clip), both_hands, INITIAL, SMOKE.hand, SMOKE.object, False, completion
+        )
+        for completion in (None, CompletionConfig())
+    ]
+    assert built[0].facts == {}
+    assert built[1].facts == {"object seen": "43% of its surface", "object completed": "as told"}
+    assert built[0].scene.object_surface.verts.shape != built[1].scene.object_surface.verts.shape
+
+
+def test_the_description_counts_kinds() -> None:
+    from bigs.geometry.symmetry import Symmetry
+
+    plane = Symmetry("plane", np.zeros(3), np.eye(3)[0])
+    axis = Symmetry("axis", np.zeros(3), np.eye(3)[0])
+    grid = DistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 1.0)
+    found = Completion(grid, 0.5, [plane, axis, plane], np.zeros((7, 3)), np.zeros((7, 3)))
+    text = "2 mirror planes, 1 axis of revolution found, 7 points added where nothing was seen"
+    assert str(found) == text
+
+
+def test_the_command_line_names_the_kinds(tmp_path: Path) -> None:
+    from typing import get_args
+
+    from bigs.cli.runs import Prior
+    from bigs.train.config import PriorKind
+
+    assert set(get_args(Prior)) == {"auto", *get_args(PriorKind)}
