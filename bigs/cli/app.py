@@ -14,7 +14,7 @@ import tyro
 
 from bigs import __version__
 from bigs.checks import InputError
-from bigs.cli import bench, clips, preprocess, prior, runs, scores
+from bigs.cli import batch, bench, clips, preprocess, prior, runs, scores
 from bigs.cli.terminal import fail, say
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
@@ -38,6 +38,7 @@ COMMANDS: Commands = {
     "render": runs.render,
     "export": runs.export,
     "view": runs.view,
+    "batch": batch.batch,
     "ablate": runs.ablate,
     "prior": {"fit": prior.prior_fit},
     "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},

@@ -1,0 +1,102 @@
+"""The command `bigs batch`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast
+
+import tyro
+
+from bigs.checks import InputError
+from bigs.cli.terminal import Preset, fail_for, print_table, say, settings_of, stderr
+
+if TYPE_CHECKING:
+    from bigs.commands.engines import Engine
+    from bigs.commands.manifest import Entry
+    from bigs.train.config import RunConfig
+
+EngineName = Literal["processes", "slurm", "ray"]
+
+
+def batch(
+    manifest: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    engine: EngineName = "processes",
+    workers: int = 0,
+    threads: int = 0,
+    retries: int = 1,
+    preset: Preset = "full",
+    hand_model: Path | None = None,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    ray_address: str | None = None,
+    slurm: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    slurm_cluster: Literal["slurm", "local"] = "slurm",
+) -> None:
+    """Reconstruct many clips; finished ones are kept, and one that fails does not stop the others.
+
+    Args:
+        manifest: clips and their options: .txt (a clip a line), .csv, .yaml or .json; see docs/batch.md.
+        out: folder for one run folder per clip, summary.csv, summary.md and index.html.
+        engine: processes on this machine, a Slurm cluster, or a Ray cluster.
+        workers: clips at a time; 0 takes as many as there are cores (processes) or all (slurm, ray).
+        threads: CPU threads for each clip; 0 shares this machine's out (processes) or is 2 (slurm, ray).
+        retries: further attempts at a clip that fails or whose worker dies, from its last checkpoint.
+        preset: for clips whose entry names none.
+        hand_model: for clips whose entry names none.
+        set: change one setting for all clips, as path=value; repeatable.
+        without: leave out one ingredient for all clips; repeatable.
+        ray_address: of a running Ray cluster; without it (and RAY_ADDRESS) one is started on this machine.
+        slurm: an option of submitit, as name=value (slurm_partition=cpu, timeout_min=120); repeatable.
+        slurm_cluster: local runs submitit's jobs as processes of this machine, to try it out.
+    """
+    from bigs.commands.batch import BatchPlan, plan_batch, run_batch, share_threads
+    from bigs.commands.manifest import read_manifest
+    from bigs.train.presets import PRESETS
+    from bigs.train.switches import without_all
+
+    if retries < 0:
+        raise InputError(f"--retries: expected 0 or more, found {retries}")
+    for name, value, owner in (("--ray-address", ray_address, "ray"), ("--slurm", slurm, "slurm")):
+        if value and engine != owner:
+            raise InputError(f"{name}: expected --engine {owner}, found {engine}")
+
+    def config_of(entry: Entry) -> RunConfig:
+        chosen = entry.preset or preset
+        if chosen not in PRESETS:
+            raise InputError(
+                f"{manifest}: {entry.name}: preset: expected one of {', '.join(PRESETS)}, found {chosen!r}"
+            )
+        settings = settings_of(cast(Preset, chosen), entry.config, (*set, *entry.set))
+        return without_all(settings, (*without, *entry.without))[0]
+
+    entries = read_manifest(manifest)
+    if engine == "processes":
+        workers, threads = share_threads(workers, threads, len(entries))
+    else:
+        workers, threads = share_threads(workers or len(entries), threads or 2, len(entries))
+    plan = BatchPlan(out, tuple(plan_batch(entries, out, config_of, hand_model)), threads, retries)
+    options = dict(map(_option, slurm))
+
+    def start() -> Engine:
+        from bigs.commands.engines import Processes, RayCluster, SlurmJobs
+
+        if engine == "slurm":
+            return SlurmJobs(out / "slurm", threads, options, slurm_cluster)
+        return RayCluster(workers, threads, ray_address) if engine == "ray" else Processes()
+
+    with stderr.status("starting") as status:
+        result = run_batch(plan, start, workers, listen=status.update)
+    print_table(result.table)
+    for name, why in result.failed.items():
+        say(f"{name}: {why}")
+    say(f"{result.kept} clips were finished before; {result.attempts} attempts at the others")
+    say(f"results in {out}: see index.html")
+    fail_for(list(result.failed))
+
+
+def _option(text: str) -> tuple[str, str | int]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise InputError(f"--slurm {text}: expected name=value")
+    return name, int(value) if value.isdecimal() else value

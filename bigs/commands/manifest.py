@@ -1,0 +1,133 @@
+"""The manifest of a batch: which clips, each with options of its own. YAML, JSON, CSV or plain text."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bigs.checks import InputError, check_choice
+
+SUFFIXES = (".yaml", ".yml", ".json", ".csv", ".txt")
+# What separates several values in a cell of a CSV file.
+_SEPARATOR = ";"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One clip of a batch; None and () are what the batch has for all."""
+
+    clip: Path
+    name: str = ""  # of its folder
+    preset: str | None = None
+    config: Path | None = None
+    hand_model: Path | None = None
+    gt: Path | None = None
+    set: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+
+
+_FIELDS = tuple(field.name for field in fields(Entry))
+_PATHS = ("clip", "config", "hand_model", "gt")
+_LISTS = ("set", "without")
+
+
+def read_manifest(path: Path) -> list[Entry]:
+    """The clips of a manifest, each with a name of its own.
+
+    A text file has a clip a line. A CSV file has a heading with `clip` and any of the other fields; several
+    values of a cell are separated by semicolons. YAML and JSON have a list of paths or of mappings, or a
+    mapping with `clips` (such a list) and `defaults` (fields for all). Paths are relative to the manifest.
+
+    Raises:
+        InputError: no such file, another suffix, an unknown field, a value of another kind, no clip, or a
+            name that comes twice.
+    """
+    check_choice(f"{path}: suffix", path.suffix.lower(), SUFFIXES)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: expected a manifest, found no such file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected text, found other bytes") from None
+    rows = [_entry(f"{path}: entry {i}", row, path.parent) for i, row in enumerate(_rows(path, text), 1)]
+    if not rows:
+        raise InputError(f"{path}: expected at least one clip, found none")
+    return _named(path, rows)
+
+
+def _rows(path: Path, text: str) -> Sequence[Any]:
+    kind = path.suffix.lower()
+    if kind == ".txt":
+        lines = (line.split("#", 1)[0].strip() for line in text.splitlines())
+        return [line for line in lines if line]
+    if kind == ".csv":
+        table = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
+        # A row that is longer than the heading has its rest under None.
+        return [{key or "more cells": cell for key, cell in row.items() if cell} for row in table]
+    try:
+        document = json.loads(text) if kind == ".json" else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: expected {kind[1:].upper()}, found: {reason}") from None
+    defaults: Mapping[str, Any] = {}
+    if isinstance(document, dict):
+        other = set(document) - {"clips", "defaults"}
+        if other:
+            raise InputError(f"{path}: expected clips and defaults, found {sorted(map(str, other))[0]}")
+        defaults = document.get("defaults") or {}
+        document = document.get("clips")
+        if not isinstance(defaults, dict):
+            raise InputError(f"{path}: defaults: expected fields and values, found {defaults!r}")
+    if not isinstance(document, list):
+        raise InputError(f"{path}: expected a list of clips, found {type(document).__name__}")
+    return [{**defaults, **(row if isinstance(row, dict) else {"clip": row})} for row in document]
+
+
+def _entry(where: str, row: Any, folder: Path) -> Entry:
+    values: dict[str, Any] = {"clip": row} if isinstance(row, str) else dict(row)
+    for key, value in values.items():
+        check_choice(f"{where}: field", key, _FIELDS)
+        if key in _LISTS:
+            parts = value.split(_SEPARATOR) if isinstance(value, str) else value
+            if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
+                raise InputError(f"{where}: {key}: expected a list of texts, found {value!r}")
+            values[key] = tuple(part.strip() for part in parts if part.strip())
+        elif not isinstance(value, str) or not value:
+            raise InputError(f"{where}: {key}: expected text, found {value!r}")
+        elif key in _PATHS:
+            values[key] = folder / value
+    if "clip" not in values:
+        raise InputError(f"{where}: expected a field clip, found {', '.join(values) or 'nothing'}")
+    name = values.get("name", "")
+    if name and (not re.fullmatch(r"[\w.+-]+", name) or name.startswith(".")):
+        raise InputError(f"{where}: name: expected letters, digits, '.', '+', '-' and '_', found {name!r}")
+    return Entry(**values)
+
+
+def _named(path: Path, entries: Sequence[Entry]) -> list[Entry]:
+    """Entries without a name get that of their clip's folder, with a number where it comes again."""
+    given = [entry.name for entry in entries if entry.name]
+    for name in given:
+        if given.count(name) > 1:
+            raise InputError(f"{path}: expected each name once, found {name!r} again")
+    taken, named = set(given), []
+    for entry in entries:
+        name = entry.name
+        if not name:
+            place = entry.clip.resolve()
+            folder = place.parent.name if place.name == "build" else place.name
+            base = re.sub(r"[^\w.+-]", "_", folder).lstrip(".") or "clip"
+            name, number = base, 1
+            while name in taken:
+                number += 1
+                name = f"{base}_{number}"
+            taken.add(name)
+        named.append(replace(entry, name=name))
+    return named

@@ -1,0 +1,123 @@
+"""Real workers on real clips, one of them killed: nothing is lost, nothing is done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+import bigs
+from bigs.data.synthetic import make_clip
+from bigs.hand import HandModel
+from bigs.types import Side
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="needs signals")]
+
+STAGES = ("hands-coarse", "hands-fine", "held", "appearance", "contact", "joint", "object-detail")
+QUICK = [f"stages.{stage}.{change}" for stage in STAGES for change in ("steps=4", "image_size=40")]
+# The results that two undisturbed runs share byte by byte.
+RESULTS = ("scene.safetensors", "poses.npz", "gaussians/object.ply", "metrics.json")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]) -> Path:
+    folder = tmp_path_factory.mktemp("batch") / "clip"
+    return make_clip(folder, hand_models=both_hands, frames=5, width=80, height=60, seed=1)
+
+
+def manifest(folder: Path, clip: Path, names: list[str]) -> Path:
+    """The clip under several names, and one that is not there."""
+    changes = [*QUICK, "stages.object-scale-search.candidates=3", "checkpoint_every=1"]
+    entries = [{"clip": str(clip), "name": name} for name in names]
+    document = {
+        "defaults": {"preset": "smoke", "set": changes},
+        "clips": [*entries, {"clip": "gone", "name": "gone"}],
+    }
+    (folder / "manifest.yaml").write_text(yaml.safe_dump(document))
+    return folder / "manifest.yaml"
+
+
+def start(*arguments: str | Path, said: Path) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(bigs.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "bigs.cli", "batch", *map(str, arguments)]
+    with said.open("wb") as file:
+        return subprocess.Popen(command, env=environment, stdout=file, stderr=file)
+
+
+def kill_the_first_at_work(out: Path, batch: subprocess.Popen[bytes]) -> str:
+    """Kill the worker of the first clip that has a checkpoint and is not done."""
+    end = time.monotonic() + 240
+    while time.monotonic() < end and batch.poll() is None:
+        for path in out.glob("*/status.json"):
+            status = json.loads(path.read_text())
+            begun = (path.parent / "checkpoints" / "latest.safetensors").exists()
+            if status["state"] == "running" and begun and not (path.parent / "scene.safetensors").exists():
+                os.kill(status["pid"], signal.SIGKILL)
+                return path.parent.name
+        time.sleep(0.02)
+    raise AssertionError("no clip was ever at work")
+
+
+def statuses(out: Path) -> dict[str, dict]:
+    return {path.parent.name: json.loads(path.read_text()) for path in out.glob("*/status.json")}
+
+
+@pytest.mark.parametrize("engine", ["ray", "processes"])
+def test_a_worker_is_killed_mid_clip(clip: Path, tmp_path: Path, engine: str) -> None:
+    if engine == "ray":
+        pytest.importorskip("ray", reason="needs the extra 'ray'")
+    names = ["a", "b", "c"] if engine == "ray" else ["a", "b"]
+    out, said = tmp_path / "out", tmp_path / "said"
+    options = ["--out", out, "--engine", engine, "--workers", "2", "--threads", "1"]
+    path = manifest(tmp_path, clip, names)
+    batch = start(path, *options, said=said)
+    victim = kill_the_first_at_work(out, batch)
+    # The clip that is not there is told by the exit code, and by its row.
+    assert batch.wait(300) == 5, said.read_text()
+
+    found = statuses(out)
+    assert {name: status["state"] for name, status in found.items()} == {
+        **dict.fromkeys(names, "finished"),
+        "gone": "failed",
+    }
+    assert {name: status["attempts"] for name, status in found.items()} == {
+        **{name: 1 + (name == victim) for name in names},
+        "gone": 1,
+    }
+    assert len({status["pid"] for status in found.values()}) >= 2
+    for name in names:
+        log = (out / name / "batch.log").read_text()
+        assert log.count("finished") == 1
+        assert log.count("attempt ") == 1 + (name == victim)
+        # The killed one went on from its checkpoint and came to the same end.
+        assert [
+            f for f in RESULTS if (out / name / f).read_bytes() != (out / names[0] / f).read_bytes()
+        ] == []
+    steps = [json.loads(line) for line in (out / victim / "log.jsonl").read_text().splitlines()]
+    places = [(event["index"], event["step"]) for event in steps if event["event"] == "step"]
+    assert places == sorted(set(places))
+    assert "gone: expected a clip" in (out / "summary.md").read_text()
+
+    # Called again, nothing is done twice: only the missing clip is tried.
+    before = {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names}
+    again = start(path, "--out", out, "--threads", "1", said=said)
+    assert again.wait(120) == 5
+    assert "clips were finished before; 1 attempts" in said.read_text()
+    assert {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names} == before
+
+
+def test_submitit_in_processes_of_its_own(clip: Path, tmp_path: Path) -> None:
+    pytest.importorskip("submitit", reason="needs the extra 'slurm'")
+    out, said = tmp_path / "out", tmp_path / "said"
+    options = ["--engine", "slurm", "--slurm-cluster", "local", "--threads", "1", "--slurm", "timeout_min=5"]
+    assert start(manifest(tmp_path, clip, ["a"]), "--out", out, *options, said=said).wait(200) == 5
+    found = statuses(out)
+    assert (found["a"]["state"], found["gone"]["state"]) == ("finished", "failed"), said.read_text()
+    assert found["a"]["pid"] != found["gone"]["pid"]
