@@ -18,7 +18,8 @@ from bigs.commands.engines import Engine
 from bigs.commands.manifest import Entry
 from bigs.commands.run_folder import PREVIEW_PICTURE, REPORT
 from bigs.commands.run_lock import only_writer
-from bigs.commands.series import Listener, PlannedRun, check_folders, find_ground_truth
+from bigs.commands.series import Listener, PlannedRun, check_folders
+from bigs.commands.truth import find_ground_truth
 from bigs.metrics.report import METRICS as METRIC_NAMES
 from bigs.train.config import RunConfig
 from bigs.viewer.batch_page import PageRow, write_batch_page
