@@ -2,22 +2,204 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from bigs.checks import InputError
+from bigs.commands.preprocess_pictures import joints_of, with_points, with_skeletons, write_sheet
 from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
-from bigs.preprocess.artefacts import ALIGNED_FILE, SFM_FILE, read_alignment, read_frame_set, read_object_sfm
+from bigs.data.images import read_image, read_mask
+from bigs.hand import load_hand_models
+from bigs.preprocess.align import AlignConfig, align
+from bigs.preprocess.artefacts import (
+    ALIGNED_FILE,
+    HANDS_FILE,
+    MASKS,
+    SFM_FILE,
+    Alignment,
+    FrameSet,
+    ObjectSfm,
+    content_digest,
+    frame_paths,
+    mask_paths,
+    read_alignment,
+    read_frame_set,
+    read_hands,
+    read_object_sfm,
+    write_alignment,
+    write_frame_set,
+    write_json,
+    write_object_sfm,
+)
+from bigs.preprocess.sfm import SfmConfig, SfmReport, structure_from_motion
+from bigs.types import Side
+
+# What structure from motion has to say of every frame.
+SFM_REPORT = "object_sfm.json"
+ALIGN_REPORT = "aligned.json"
 
 
 def object_step(request: PreprocessRequest, listen: Callable[[str], None]) -> StepOutcome:
-    """`object_sfm.npz`."""
-    frames = len(read_frame_set(request.processed).names)
-    sfm = read_object_sfm(request.processed / SFM_FILE, frames)
-    summary = f"{len(sfm.points)} points, a pose in {int(sfm.valid.sum())} of {frames} frames"
-    return StepOutcome("object", "supplied", summary, (), None)
+    """`object_sfm.npz` from frames and masks, and its report `object_sfm.json`.
+
+    When the focal length was only assumed, `frames.json` gets the one that was estimated.
+    """
+    processed = request.processed
+    frames = read_frame_set(processed)
+    count = len(frames.names)
+    file, picture, report_file = processed / SFM_FILE, processed / "object.png", processed / SFM_REPORT
+    config = SfmConfig()
+    state = request.state(file, _object_inputs(processed, frames, config))
+    if state in ("current", "supplied"):
+        notes = _stored_notes(report_file) if state == "current" else ()
+        summary = _object_summary(read_object_sfm(file, count))
+        return _kept("object", state, summary, notes, picture)
+    listen("finding features")
+    labels = _labels(processed, frames)
+    images = [read_image(path) for path in frame_paths(processed, frames)]
+    found, report = structure_from_motion(images, labels, frames.K, config, known_focal=frames.focal_known)
+    notes = report.sentences()
+    if not frames.focal_known:
+        frames, note = _with_focal(processed, frames, report.focal)
+        notes.append(note)
+    inputs = _object_inputs(processed, frames, config)
+    write_json(report_file, _report_table(report) | {"notes": notes}, inputs)
+    write_object_sfm(file, found, inputs)
+    _draw_object(picture, processed, frames, found)
+    return StepOutcome("object", "made", _object_summary(found), tuple(notes), picture)
 
 
 def align_step(request: PreprocessRequest, listen: Callable[[str], None]) -> StepOutcome:
-    """`aligned.npz`."""
-    frames = len(read_frame_set(request.processed).names)
-    alignment = read_alignment(request.processed / ALIGNED_FILE, frames)
-    return StepOutcome("align", "supplied", f"{alignment.scale:.4g} metres per unit", (), None)
+    """`aligned.npz` from hands, object poses and masks, and how the size was found as `aligned.json`."""
+    processed = request.processed
+    frames = read_frame_set(processed)
+    count = len(frames.names)
+    file, picture = processed / ALIGNED_FILE, processed / "aligned.png"
+    config = AlignConfig()
+    model = "built-in" if request.hand_model is None else request.hand_model
+    parts = (processed / HANDS_FILE, processed / SFM_FILE, processed / MASKS)
+    inputs = content_digest(*parts, model, frames.K, asdict(config))
+    state = request.state(file, inputs)
+    if state in ("current", "supplied"):
+        summary = _alignment_summary(
+            read_alignment(file, count), read_object_sfm(processed / SFM_FILE, count)
+        )
+        return _kept("align", state, summary, (), picture)
+    listen("searching the object's size")
+    models = load_hand_models(request.hand_model)
+    hands = read_hands(processed / HANDS_FILE, count)
+    sfm = read_object_sfm(processed / SFM_FILE, count)
+    found, report = align(hands, sfm, _labels(processed, frames), frames.K, models, config)
+    table = {
+        "touching": {side: np.flatnonzero(t) for side, t in report.touching.items()},
+        "factors": report.factors,
+        "costs": report.costs,
+        "shifts": report.shifts,
+        "notes": report.notes,
+    }
+    write_json(processed / ALIGN_REPORT, table, inputs)
+    write_alignment(file, found, inputs)
+    moved = {side: replace(track, transl=found.hand_transl[side]) for side, track in hands.items()}
+    joints = {side: joints_of(track, models[side]) for side, track in moved.items()}
+    _draw_aligned(picture, processed, frames, sfm, found, joints)
+    return StepOutcome("align", "made", _alignment_summary(found, sfm), report.notes, picture)
+
+
+def _object_inputs(processed: Path, frames: FrameSet, config: SfmConfig) -> str:
+    return content_digest(
+        *frame_paths(processed, frames), processed / MASKS, frames.K, frames.focal_known, asdict(config)
+    )
+
+
+def _labels(processed: Path, frames: FrameSet) -> np.ndarray:
+    size = (frames.width, frames.height)
+    return np.stack([read_mask(path, size) for path in mask_paths(processed, frames)])
+
+
+def _with_focal(processed: Path, frames: FrameSet, focal: float) -> tuple[FrameSet, str]:
+    """`frames.json` with the estimated focal length, and a sentence about it."""
+    K = frames.K.copy()
+    K[0, 0], K[1, 1] = focal, focal * K[1, 1] / K[0, 0]
+    stored = json.loads((processed / "frames.json").read_text(encoding="utf-8"))
+    changed = replace(frames, K=K, camera="estimated from the object's motion")
+    write_frame_set(processed, changed, str(stored.get("inputs", "")))
+    note = (
+        f"focal length estimated as {focal:.0f} pixels (assumed {frames.K[0, 0]:.0f}); give --focal if known"
+    )
+    return changed, note
+
+
+def _report_table(report: SfmReport) -> dict[str, Any]:
+    """The report as it is written: one row a frame."""
+    checks = report.checks
+    rows = [
+        {
+            "frame": t,
+            "features": int(report.features[t]),
+            "matches_with_next": int(report.neighbour_matches[t]),
+            "model": int(report.model[t]),
+            "sightings": int(checks.sightings[t]),
+            "uncertainty_degrees": round(float(checks.uncertainty[t]), 3),
+            "mirror_ratio": round(float(checks.mirror[t]), 3),
+            "turn_cosine": round(float(checks.cosine[t]), 3),
+            "flags": checks.flags[t],
+        }
+        for t in range(len(report.features))
+    ]
+    return {"models": report.models, "starts_tried": report.tried, "focal": report.focal, "frames": rows}
+
+
+def _object_summary(sfm: ObjectSfm) -> str:
+    count = len(sfm.valid)
+    text = f"{len(sfm.points)} points, a pose in {int(sfm.valid.sum())} of {count} frames"
+    doubtful = int((sfm.confidence == 0).sum())
+    return f"{text}, {doubtful} of them doubtful" if doubtful else text
+
+
+def _alignment_summary(alignment: Alignment, sfm: ObjectSfm) -> str:
+    size = alignment.scale * float(np.ptp(sfm.points, axis=0).max())
+    return f"object about {100.0 * size:.0f} cm, {np.median(alignment.object_transl[:, 2]):.2f} m away"
+
+
+def _stored_notes(file: Path) -> tuple[str, ...]:
+    if not file.exists():
+        return ()
+    try:
+        return tuple(str(note) for note in json.loads(file.read_text(encoding="utf-8"))["notes"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: expected a report with notes, found {error}") from None
+
+
+def _kept(name: Any, state: str, summary: str, notes: tuple[str, ...], picture: Path) -> StepOutcome:
+    kept = "supplied" if state == "supplied" else "up to date"
+    return StepOutcome(name, kept, summary, notes, picture if picture.exists() else None)  # type: ignore[arg-type]
+
+
+def _draw_object(picture: Path, processed: Path, frames: FrameSet, sfm: ObjectSfm) -> None:
+    def draw(t: int, image: np.ndarray) -> np.ndarray:
+        points = sfm.points @ sfm.rotations[t].T + sfm.transl[t]
+        return with_points(image, points, frames.K, bool(sfm.confidence[t] > 0))
+
+    write_sheet(picture, frame_paths(processed, frames), frames.names, draw)
+
+
+def _draw_aligned(
+    picture: Path,
+    processed: Path,
+    frames: FrameSet,
+    sfm: ObjectSfm,
+    found: Alignment,
+    joints: dict[Side, np.ndarray],
+) -> None:
+    def draw(t: int, image: np.ndarray) -> np.ndarray:
+        points = found.scale * sfm.points @ found.object_rotations[t].T + found.object_transl[t]
+        marked = with_points(image, points, frames.K, bool(found.object_valid[t]))
+        shown = {side: hand[t] for side, hand in joints.items()}
+        return with_skeletons(marked, shown, dict.fromkeys(shown, True), frames.K)
+
+    write_sheet(picture, frame_paths(processed, frames), frames.names, draw)

@@ -265,4 +265,6 @@ def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     matrix = scipy.sparse.csr_matrix(
         (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
     )
-    return (matrix @ values.reshape(len(index), -1)).reshape(count, *values.shape[1:])
+    return (matrix @ values.reshape(len(index), int(np.prod(values.shape[1:])))).reshape(
+        count, *values.shape[1:]
+    )

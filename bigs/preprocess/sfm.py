@@ -18,6 +18,7 @@ from bigs.preprocess.sfm_models import Mapping, MappingConfig, map_features
 from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
 from bigs.preprocess.sfm_seed import Seed, find_seed
 from bigs.preprocess.tracks import Tracks, join_matches
+from bigs.preprocess.words import frame_ranges
 from bigs.types import MASK_VALUES
 
 
@@ -49,8 +50,8 @@ class SfmReport(NamedTuple):
         """The outcome in plain words: what is wrong, with frame ranges, and what could be done."""
         words: list[str] = []
         for flag in dict.fromkeys(word for frame in self.checks.flags for word in frame):
-            frames = [t for t, frame in enumerate(self.checks.flags) if flag in frame]
-            words.append(f"frames {frame_ranges(frames)}: {_EXPLAINED[flag]}")
+            frames = np.array([flag in frame for frame in self.checks.flags])
+            words.append(f"{frame_ranges(frames)}: {_EXPLAINED[flag]}")
         return words
 
 
@@ -239,14 +240,3 @@ def _result(
         colors=colors[keep],
         norm_mat=normalisation(points),
     )
-
-
-def frame_ranges(frames: Sequence[int]) -> str:
-    """Frame numbers in ascending order as text, runs shortened: "0, 3-5"."""
-    runs: list[list[int]] = []
-    for t in frames:
-        if runs and t == runs[-1][-1] + 1:
-            runs[-1].append(t)
-        else:
-            runs.append([t])
-    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)

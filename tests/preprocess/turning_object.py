@@ -1,4 +1,4 @@
-"""A dotted egg that turns before a camera: exact poses, the features that would be found, and their matches."""
+"""A dotted egg that turns before a camera: exact poses, the features to be found, and their matches."""
 
 from __future__ import annotations
 

@@ -1,0 +1,67 @@
+"""A rough surface of the object from its masks and points: enough to tell how far a hand is from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bigs.geometry.surface import (
+    DistanceGrid,
+    VisualHull,
+    blend_with_points,
+    convex_distance,
+    empty_grid,
+    inlier_points,
+    point_normals,
+    silhouette_around_points,
+)
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Lengths in metres."""
+
+    resolution: int = 48  # cells along the longest side
+    frames: int = 24  # silhouettes that carve, spread over the clip
+    agreeing: int = 3  # of them must agree before a place is carved away
+    reach: float = 0.016  # at this distance from the nearest point the hull alone decides
+    margin: float = 0.01  # how far the surface may leave the points' convex hull
+
+
+def rough_surface(
+    points: np.ndarray,
+    rotations: np.ndarray,
+    transl: np.ndarray,
+    confidence: np.ndarray,
+    masks: np.ndarray,
+    K: np.ndarray,
+    config: SurfaceConfig,
+) -> DistanceGrid:
+    """The visual hull blended with the points' planes, cut back to near their convex hull.
+
+    Args:
+        points: [N, 3] metres, object frame.
+        rotations, transl: [T, 3, 3] and [T, 3], object to camera.
+        confidence: [T]; frames that have none do not carve.
+        masks: [T, H, W] labels; whatever is not background may hide the object.
+        K: [3, 3].
+        config: see there.
+    """
+    points = points[inlier_points(points)]
+    size = float((points.max(0) - points.min(0)).max())
+    grid = empty_grid(points.min(0) - 0.15 * size, points.max(0) + 0.15 * size, config.resolution)
+    corners = grid.points()
+    bound = convex_distance(corners, points) - config.margin
+    usable = np.flatnonzero(confidence > 0) if (confidence > 0).any() else np.arange(len(masks))
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, config.frames).round().astype(int))]
+    silhouettes = [
+        silhouette_around_points(masks[t] != 0, points @ rotations[t].T + transl[t], K) for t in chosen
+    ]
+    hull = VisualHull(
+        np.stack(silhouettes), K, rotations[chosen], transl[chosen], min(config.agreeing, len(chosen))
+    )
+    distance = np.maximum(hull.distance(corners, stop=config.reach), bound)
+    carved = DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
+    normals = point_normals(points, hull.outward(points, 0.5 * grid.spacing))
+    return blend_with_points(carved, points, normals, config.reach)
