@@ -56,9 +56,9 @@ def object_step(request: PreprocessRequest, listen: Callable[[str], None]) -> St
     config = SfmConfig()
     state = request.state(file, _object_inputs(processed, frames, config))
     if state in ("current", "supplied"):
-        notes = _stored_notes(report_file) if state == "current" else ()
+        stored = _stored_notes(report_file) if state == "current" else ()
         summary = _object_summary(read_object_sfm(file, count))
-        return _kept("object", state, summary, notes, picture)
+        return _kept("object", state, summary, stored, picture)
     listen("finding features")
     labels = _labels(processed, frames)
     images = [read_image(path) for path in frame_paths(processed, frames)]

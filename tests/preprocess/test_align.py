@@ -1,0 +1,137 @@
+"""Object size and hand depth from contact, against a generated clip whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from bigs.checks import InputError
+from bigs.data.base import HandTrack
+from bigs.data.hold import load_hold
+from bigs.data.synthetic import make_clip
+from bigs.geometry.surface import DistanceGrid
+from bigs.hand import HandModel, load_hand_models
+from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices, sample_grid
+from bigs.preprocess.artefacts import ObjectSfm
+from bigs.types import Side
+
+FRAMES = 12
+UNIT = 0.31  # metres per unit of the simulated structure from motion
+
+
+@dataclass(frozen=True)
+class Truth:
+    hands: dict[Side, HandTrack]
+    sfm: ObjectSfm
+    masks: np.ndarray
+    K: np.ndarray
+    models: dict[Side, HandModel]
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    pytest.importorskip("embreex")
+    models = load_hand_models(None)
+    folder: Path = make_clip(
+        tmp_path_factory.mktemp("align") / "clip", hand_models=models, frames=FRAMES, seed=4
+    )
+    clip = load_hold(folder)
+    everywhere = np.ones(FRAMES, dtype=bool)
+    with np.load(folder / "gt.npz") as gt:
+        hands: dict[Side, HandTrack] = {}
+        sides: tuple[Side, ...] = ("right", "left")
+        for side in sides:
+            pose = gt[f"{side}_pose"].reshape(FRAMES, 16, 3)
+            hands[side] = HandTrack(
+                pose[:, 0], pose[:, 1:], gt[f"{side}_trans"], gt[f"{side}_betas"], everywhere
+            )
+        rotations, transl = gt["obj_R"], gt["obj_t"]
+    mesh = trimesh.load(folder / "gt_object.ply", process=False)
+    points, _ = trimesh.sample.sample_surface_even(mesh, 1200, seed=0)
+    sfm = ObjectSfm(
+        rotations,
+        transl / UNIT,
+        everywhere,
+        np.ones(FRAMES),
+        np.asarray(points) / UNIT,
+        np.zeros((len(points), 3), dtype=np.uint8),
+        np.eye(4),
+    )
+    return Truth(hands, sfm, np.stack([clip.mask(t) for t in range(FRAMES)]), clip.K, models)
+
+
+def pushed(truth: Truth, shares: np.ndarray) -> dict[Side, HandTrack]:
+    """The hands, moved along their rays by `shares` [T] of their distance."""
+    moved = {}
+    for side, track in truth.hands.items():
+        middle = posed_vertices(track, truth.models[side]).mean(1)
+        moved[side] = replace(track, transl=track.transl + shares[:, None] * middle)
+    return moved
+
+
+def test_true_hands_give_the_true_size_and_stay(truth: Truth) -> None:
+    found, report = align(truth.hands, truth.sfm, truth.masks, truth.K, truth.models, AlignConfig())
+    assert found.scale == pytest.approx(UNIT, rel=0.03)
+    assert all(touching.any() for touching in report.touching.values())
+    for side, track in truth.hands.items():
+        assert np.abs(found.hand_transl[side] - track.transl).max() < 0.012
+    np.testing.assert_allclose(found.object_transl, found.scale * truth.sfm.transl)
+
+
+def test_hands_at_wrong_depths_are_brought_to_the_object(truth: Truth) -> None:
+    shares = 0.04 * np.cos(np.linspace(0.0, 3.1, FRAMES))
+    hands = pushed(truth, shares)
+    found, _ = align(hands, truth.sfm, truth.masks, truth.K, truth.models, AlignConfig())
+    assert found.scale == pytest.approx(UNIT, rel=0.08)
+    for side, track in truth.hands.items():
+        # The same error of scale in hand and object is no error between them.
+        size = found.scale / UNIT
+        before = np.linalg.norm(hands[side].transl - track.transl, axis=1)
+        after = np.linalg.norm(found.hand_transl[side] / size - track.transl, axis=1)
+        assert after.mean() < 0.7 * before.mean()
+
+
+def test_without_contact_the_object_is_put_at_the_hands_depth(truth: Truth) -> None:
+    apart = np.where(truth.masks == 50, 0, truth.masks)
+    apart[:, :4, :4] = 50
+    apart[:, :8, :8][apart[:, :8, :8] != 50] = 0
+    found, report = align(truth.hands, truth.sfm, apart, truth.K, truth.models, AlignConfig())
+    assert found.scale == pytest.approx(UNIT, rel=0.15)
+    assert "never touch" in report.notes[0]
+    for side, track in truth.hands.items():
+        assert np.array_equal(found.hand_transl[side], track.transl)
+
+
+def test_without_hands_there_is_no_size(truth: Truth) -> None:
+    with pytest.raises(InputError, match="at least one hand"):
+        align({}, truth.sfm, truth.masks, truth.K, truth.models, AlignConfig())
+
+
+def test_the_cheapest_path_is_the_cheapest_of_all() -> None:
+    rng = np.random.default_rng(0)
+    config = AlignConfig(shifts=4)
+    costs = rng.random((4, 4))
+    shares = np.linspace(-config.reach, config.reach, 4)
+
+    def total(path: tuple[int, ...]) -> float:
+        moved = np.diff(shares[list(path)])
+        return float(
+            sum(costs[t, s] for t, s in enumerate(path))
+            + config.prior * ((moved / config.change_sigma) ** 2).sum()
+        )
+
+    best = min(np.ndindex(4, 4, 4, 4), key=total)
+    cost, path = cheapest_path(costs, config)
+    assert tuple(path) == best and cost == pytest.approx(total(best))
+
+
+def test_a_grid_is_sampled_inside_and_beyond() -> None:
+    axis = np.linspace(-1.0, 1.0, 21)
+    values = np.broadcast_to(axis[:, None, None], (21, 21, 21)).copy()
+    grid = DistanceGrid(values, np.full(3, -1.0), 0.1)
+    points = np.array([[0.33, 0.0, 0.2], [2.0, 0.0, 0.0]])
+    np.testing.assert_allclose(sample_grid(grid, points), [0.33, 2.0], atol=1e-9)
