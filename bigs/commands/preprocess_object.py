@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.commands.preprocess_pictures import joints_of, with_points, with_skeletons, write_sheet
+from bigs.commands.preprocess_pictures import with_points, with_skeletons, write_sheet
 from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
 from bigs.data.images import read_image, read_mask
 from bigs.hand import load_hand_models
@@ -36,6 +36,7 @@ from bigs.preprocess.artefacts import (
     write_json,
     write_object_sfm,
 )
+from bigs.preprocess.hands import joints_of_track
 from bigs.preprocess.sfm import SfmConfig, SfmReport, structure_from_motion
 from bigs.types import Side
 
@@ -105,7 +106,7 @@ def align_step(request: PreprocessRequest, listen: Callable[[str], None]) -> Ste
     write_json(processed / ALIGN_REPORT, table, inputs)
     write_alignment(file, found, inputs)
     moved = {side: replace(track, transl=found.hand_transl[side]) for side, track in hands.items()}
-    joints = {side: joints_of(track, models[side]) for side, track in moved.items()}
+    joints = {side: joints_of_track(track, models[side]) for side, track in moved.items()}
     _draw_aligned(picture, processed, frames, sfm, found, joints)
     return StepOutcome("align", "made", _alignment_summary(found, sfm), report.notes, picture)
 

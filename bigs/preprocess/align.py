@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-import torch
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
-from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
+from bigs.preprocess.hands import posed_track
 from bigs.preprocess.object_surface import SurfaceConfig, rough_surface
 from bigs.types import MASK_VALUES, Side
 
@@ -154,16 +153,9 @@ def _alignment(scale: float, sfm: ObjectSfm, hand_transl: dict[Side, np.ndarray]
     return Alignment(scale, sfm.rotations, scale * sfm.transl, sfm.valid, hand_transl)
 
 
-@torch.no_grad()
 def posed_vertices(track: HandTrack, model: HandModel) -> np.ndarray:
     """Vertices [T, V, 3] of a track in the camera frame, metres."""
-    orient, pose, betas, transl = (
-        torch.as_tensor(array, dtype=torch.float32)
-        for array in (track.global_orient, track.hand_pose, track.betas, track.transl)
-    )
-    wrist = model.rest_joints(betas)[0] + transl
-    out = model(betas, model.pose_matrices(pose), axis_angle_to_matrix(orient), wrist)
-    return out.vertices.double().numpy()
+    return posed_track(track, model).vertices.double().numpy()
 
 
 def touching_frames(masks: np.ndarray, side: Side, reach: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from bigs.data.base import HandTrack
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand import HandModel, mirror_axis_angle, mirror_points, mirror_rotation, shared_betas
+from bigs.hand.model import HandOutput
 from bigs.preprocess.hand_fit import HandFitConfig, fit_rays
 from bigs.preprocess.keypoints import Keypoints
 from bigs.preprocess.sides import drop_strays, sort_sides
@@ -91,15 +92,19 @@ def fit_hands(
 
 
 @torch.no_grad()
-def joints_of_track(track: HandTrack, model: HandModel) -> np.ndarray:
-    """The 21 joints [T, 21, 3] of a track in its own space, metres."""
+def posed_track(track: HandTrack, model: HandModel) -> HandOutput:
+    """A track's vertices and joints in its own space, metres."""
     orient, pose, betas, transl = (
         torch.as_tensor(array, dtype=torch.float32)
         for array in (track.global_orient, track.hand_pose, track.betas, track.transl)
     )
     wrist = model.rest_joints(betas)[0] + transl
-    out = model(betas, model.pose_matrices(pose), axis_angle_to_matrix(orient), wrist)
-    return out.joints.double().numpy()
+    return model(betas, model.pose_matrices(pose), axis_angle_to_matrix(orient), wrist)
+
+
+def joints_of_track(track: HandTrack, model: HandModel) -> np.ndarray:
+    """The 21 joints [T, 21, 3] of a track in its own space, metres."""
+    return posed_track(track, model).joints.double().numpy()
 
 
 def _clean(
