@@ -50,8 +50,8 @@ def evaluate(
     with stderr.status("starting") as status:
         found = {name: evaluate_run(run, plan, status.update) for name, run in zip(names, runs, strict=True)}
     for name, evaluation in found.items():
-        for line in evaluation.missing:
-            say(f"{name}: not scored: {line}")
+        for line in evaluation.remarks:
+            say(f"{name}: {line}")
     if len(runs) == 1:
         print_table(found[names[0]].table())
     elif out is None:

@@ -19,7 +19,7 @@ from bigs.commands.paper_tables import beside_paper, mean_scores
 from bigs.commands.pictures import frame_scores, means, novel_scores
 from bigs.commands.run_clip import hand_models_of_run, origin_of
 from bigs.commands.run_folder import METRICS, load_run, write_json
-from bigs.commands.truth import find_ground_truth, load_truth
+from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
 from bigs.data.base import Clip
 from bigs.data.novel import CAMERAS
 from bigs.hand import HandModel, load_hand_models
@@ -63,7 +63,7 @@ class Evaluation:
     name: str  # of the clip
     scores: dict[str, dict[str, float]]  # "result", and "initial" where the run had it, by key
     frames: dict[str, np.ndarray]  # by key, [T]
-    missing: tuple[str, ...]  # what could not be scored, and why
+    remarks: tuple[str, ...]  # what could not be scored, and what to keep in mind
 
     def table(self) -> list[tuple[str, ...]]:
         """All scores as rows of text."""
@@ -81,21 +81,27 @@ def evaluate_run(
     """
     playback = load_run(run)
     origin = origin_of(run)
-    hand_models = load_hand_models(plan.hand_model) if plan.hand_model else hand_models_of_run(run)
     clip_path = plan.clip or (Path(origin["clip"]) if origin.get("clip") else None)
     distance = _perceptual(plan.perceptual_weights)
-    clip = _open_frames(clip_path, hand_models, playback, given=plan.clip is not None)
     truth_path = plan.ground_truth or (find_ground_truth(clip_path) if clip_path else None)
+    remarks: list[str] = []
+    hand_models = hand_models_of_run(run)
+    hand_file = plan.hand_model or (Path(origin["hand_model"]) if origin.get("hand_model") else None)
+    if plan.hand_model is not None or (truth_path is not None and not is_own_truth(truth_path)):
+        # A data set's poses are its truth on the hand that they were fitted with, and on no other.
+        hand_models = load_hand_models(hand_file)
+        if hand_file is None:
+            remarks.append("the data set's poses are on the built-in hand (--hand-model gives theirs)")
+    clip = _open_frames(clip_path, hand_models, playback, given=plan.clip is not None)
     if clip is None and truth_path is None and plan.novel is None:
         raise InputError(
             f"{run}: expected something to score against (--gt, --clip or --novel), found neither "
             f"that nor the run's own clip {clip_path}"
         )
-    missing: list[str] = []
     result: dict[str, float] = {}
     frames: dict[str, np.ndarray] = {}
     if truth_path is None:
-        missing.append("poses and shapes: no ground truth (--gt)")
+        remarks.append("poses and shapes are not scored: no ground truth (--gt)")
     else:
         listen(f"{run.name}: poses and shapes")
         truth = load_truth(truth_path, playback.frame_names, hand_models)
@@ -103,7 +109,7 @@ def evaluate_run(
         order = match_frames(truth.frame_names, playback.frame_names)
         frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
     if clip is None:
-        missing.append("pictures: the run's clip is not there (--clip)")
+        remarks.append("pictures are not scored: the run's clip is not there (--clip)")
     else:
         listen(f"{run.name}: pictures")
         pictures = frame_scores(clip, playback, distance)
@@ -114,13 +120,13 @@ def evaluate_run(
         listen(f"{run.name}: held-back views")
         result |= novel_scores(playback, novel, distance)
     if distance is None:
-        missing.append("LPIPS: no weights (--perceptual-weights)")
+        remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")
     path = run / METRICS
     scores = json.loads(path.read_text()) if path.exists() else {}
     scores["result"] = scores.get("result", {}) | result
     write_json(path, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
-    return Evaluation(playback.name, scores, frames, tuple(missing))
+    return Evaluation(playback.name, scores, frames, tuple(remarks))
 
 
 def run_names(runs: Sequence[Path]) -> list[str]:

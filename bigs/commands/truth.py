@@ -35,9 +35,14 @@ def load_truth(
     Raises:
         InputError: no truth there, or it is not as it should be.
     """
-    if path.suffix == ".npz" or (path / "gt.npz").is_file():
+    if is_own_truth(path):
         return load_ground_truth(path)
     return pose_annotation(read_annotation(path, frame_names, hand_models), hand_models)
+
+
+def is_own_truth(path: Path) -> bool:
+    """Whether a path means `gt.npz`, which needs no hand model, rather than a data set."""
+    return path.suffix == ".npz" or (path / "gt.npz").is_file()
 
 
 def read_annotation(

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,3 +56,16 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: expected a readable text file, found {error}") from None
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON, found {error}") from None
+
+
+def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, or an InputError that calls what was wanted `what`."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected {what}, found no such file") from None
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: expected an .npz of plain arrays, found {error or type(error).__name__}"
+        ) from None

@@ -6,7 +6,6 @@ points obj_R (obj_scale x) + obj_t for x of `gt_object.ply`.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import trimesh
 from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, require
+from bigs.data.fields import array_field, read_npz, require
 from bigs.data.meshes import read_mesh
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
@@ -38,7 +37,7 @@ def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
     """
     path = Path(path)
     file = path / "gt.npz" if path.is_dir() else path
-    arrays = _read_npz(file)
+    arrays = read_npz(file, "ground truth")
     present = [side for side in SIDES if f"{side}_verts" in arrays]
     has_object = "obj_R" in arrays
     if not present and not has_object:
@@ -77,7 +76,7 @@ def load_annotation(path: str | Path) -> Annotation:
     """
     path = Path(path)
     file = path / "gt.npz" if path.is_dir() else path
-    arrays = _read_npz(file)
+    arrays = read_npz(file, "ground truth")
     K = _field(file, arrays, "K", (3, 3))
     width, height = _field(file, arrays, "wh", (2,)).astype(int)
     hands: dict[Side, HandTrack] = {}
@@ -123,18 +122,6 @@ def write_ground_truth(
     if object_mesh is not None:
         object_mesh.export(folder / OBJECT_FILE)
     return folder / "gt.npz"
-
-
-def _read_npz(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files}
-    except FileNotFoundError:
-        raise InputError(f"{file}: expected ground truth, found no such file") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{file}: expected an .npz of plain arrays, found {error or type(error).__name__}"
-        ) from None
 
 
 def _object_poses(

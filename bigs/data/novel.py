@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.data.fields import array_field, require
+from bigs.data.fields import array_field, read_npz, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image, read_mask
 
 CAMERAS = "cameras.npz"
@@ -46,13 +45,7 @@ def load_novel_views(folder: str | Path, frame_count: int) -> list[NovelView]:
     """
     folder = Path(folder)
     file = folder / CAMERAS
-    if not file.is_file():
-        raise InputError(f"{file}: expected the cameras of held-back views, found no such file")
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: expected an .npz of plain arrays, found {error}") from None
+    arrays = read_npz(file, "the cameras of held-back views")
     image_paths = list_frames(folder / "image", IMAGE_SUFFIXES)
     mask_paths = list_frames(folder / "mask", MASK_SUFFIXES)
     check_pairs(image_paths, mask_paths)

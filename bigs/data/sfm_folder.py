@@ -15,7 +15,6 @@ away as the hands are.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.fields import array_field, mapping_field, read_json, require
+from bigs.data.fields import array_field, mapping_field, read_json, read_npz, require
 from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.images import (
     IMAGE_SUFFIXES,
@@ -185,13 +184,7 @@ def _read_colmap(folder: Path, size: tuple[int, int]) -> SfmModel:
 
 def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float | None]:
     """The hands, and metres per unit of the model where the file tells it."""
-    if not file.is_file():
-        raise InputError(f"{file}: expected estimates of the hands, found no such file")
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: expected an .npz of plain arrays, found {error}") from None
+    arrays = read_npz(file, "estimates of the hands")
     hands = {side: _read_hand(file, arrays, side, frames) for side in SIDES if f"{side}_transl" in arrays}
     if not hands:
         raise InputError(f"{file}: expected right_transl or left_transl, found {', '.join(arrays)}")

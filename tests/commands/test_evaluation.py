@@ -50,7 +50,7 @@ def test_the_runs_own_clip_gives_everything(run: Path, tiny: Clip) -> None:
     for key, texts in table.items():
         if key not in ("frame", "name"):
             assert after["result"][key] == pytest.approx(texts.astype(float).mean(), rel=1e-4), key
-    assert found.missing == ("LPIPS: no weights (--perceptual-weights)",)
+    assert found.remarks == ("LPIPS is not scored: no weights (--perceptual-weights)",)
 
 
 def test_arctics_layout_is_the_same_truth(run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path) -> None:
@@ -61,9 +61,30 @@ def test_arctics_layout_is_the_same_truth(run: Path, tiny: Clip, tiny_clip: Path
     )
     own = evaluate_run(run, EvaluationPlan()).scores["result"]
     plan = EvaluationPlan(ground_truth=tmp_path / "arctic" / "s01" / "bottle_grab_01" / "1")
-    other = evaluate_run(run, plan).scores["result"]
+    found = evaluate_run(run, plan)
+    other = found.scores["result"]
+    assert "the data set's poses are on the built-in hand" in found.remarks[0]
     for key, value in own.items():
         assert other[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
+
+
+def test_a_data_sets_truth_is_on_its_own_hands(
+    run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path, call: Callable[..., Answer]
+) -> None:
+    """The run's hand model has gone: no other may stand in for it, unless gt.npz needs none."""
+    images = [tiny.image(t) for t in range(len(tiny))]
+    write_arctic(
+        tmp_path / "arctic",
+        load_annotation(tiny_clip),
+        subject="s01",
+        sequence="bottle_grab_01",
+        images=images,
+        offset=0,
+    )
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace("hand_model: null", f"hand_model: {tmp_path}/gone"))
+    assert_refused(call("eval", run, "--gt", tmp_path / "arctic" / "s01"), f"{tmp_path}/gone")
+    assert call("eval", run, "--gt", tiny_clip).code == 0
 
 
 def test_a_held_back_view_from_the_clips_own_camera(run: Path, tiny: Clip, tmp_path: Path) -> None:
