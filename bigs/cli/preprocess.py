@@ -112,7 +112,7 @@ def preprocess(
 def frames(
     source: Clip, out: Path, options: Annotated[FrameOptions, Flat] = FrameOptions(), redo: bool = False
 ) -> None:
-    """The first step: pictures as numbered frames, and the camera.
+    """Step 1: pictures as numbered frames, and the camera.
 
     Args:
         source: a video file or a folder of images.
@@ -130,7 +130,7 @@ def masks(
     redo: bool = False,
     threads: int = 0,
 ) -> None:
-    """The second step: label images of right hand, left hand and object.
+    """Step 2: label images of right hand, left hand and object.
 
     Args:
         clip: the clip folder.
@@ -146,6 +146,18 @@ def masks(
     _run(_request(clip, None, chosen, None, redo), ("masks",))
 
 
+def object_motion(clip: Clip, redo: bool = False, threads: int = 0) -> None:
+    """Step 3: the object's motion and points, by structure from motion within its mask.
+
+    Args:
+        clip: the clip folder.
+        redo: make it anew though it is up to date.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    _run(_request(clip, None, VideoOptions(), None, redo), ("object",))
+
+
 def hands(
     clip: Clip,
     options: Annotated[HandOptions, Flat] = HandOptions(),
@@ -153,7 +165,7 @@ def hands(
     redo: bool = False,
     threads: int = 0,
 ) -> None:
-    """The third step: pose, shape and place of the hands.
+    """Step 4: pose, shape and place of the hands.
 
     Args:
         clip: the clip folder.
@@ -166,20 +178,8 @@ def hands(
     _run(_request(clip, None, VideoOptions(hands=options), hand_model, redo), ("hands",))
 
 
-def object_motion(clip: Clip, redo: bool = False, threads: int = 0) -> None:
-    """The fourth step: the object's motion and points, by structure from motion within its mask.
-
-    Args:
-        clip: the clip folder.
-        redo: make it anew though it is up to date.
-        threads: CPU threads; 0 takes all.
-    """
-    use_threads(threads)
-    _run(_request(clip, None, VideoOptions(), None, redo), ("object",))
-
-
 def align(clip: Clip, hand_model: Path | None = None, redo: bool = False, threads: int = 0) -> None:
-    """The fifth step: hands and object in one metric space.
+    """Step 5: hands and object in one metric space.
 
     Args:
         clip: the clip folder.
@@ -192,7 +192,7 @@ def align(clip: Clip, hand_model: Path | None = None, redo: bool = False, thread
 
 
 def build(clip: Clip, hand_model: Path | None = None, redo: bool = False) -> None:
-    """The last step: the build folder that HOLD and bigs reconstruct read.
+    """Step 6: the build folder that HOLD and bigs reconstruct read.
 
     Args:
         clip: the clip folder.

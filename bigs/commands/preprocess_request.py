@@ -12,7 +12,8 @@ from bigs.preprocess.frames import FrameConfig
 from bigs.types import Entity
 
 StepName = Literal["frames", "masks", "hands", "object", "align", "build"]
-STEPS: tuple[StepName, ...] = ("frames", "masks", "hands", "object", "align", "build")
+# The object comes before the hands because it may tell an unknown focal length.
+STEPS: tuple[StepName, ...] = ("frames", "masks", "object", "hands", "align", "build")
 
 
 @dataclass(frozen=True)
