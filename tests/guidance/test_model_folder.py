@@ -91,6 +91,15 @@ def test_names_of_older_text_encoders_are_understood(copy: Path, tiny_model: Pat
     assert all(torch.equal(old[name], value) for name, value in new.items())
 
 
+@pytest.mark.parametrize("kept", [["tokenizer.json"], ["vocab.json", "merges.txt"]])
+def test_tokenizers_of_either_layout_split_alike(copy: Path, tiny_model: Path, kept: list[str]) -> None:
+    for name in {"tokenizer.json", "vocab.json", "merges.txt"} - set(kept):
+        (copy / "tokenizer" / name).unlink()
+    found, expected = (load_parts(str(folder), device="cpu").tokenizer for folder in (copy, tiny_model))
+    assert found("A photo, of 1 mug!").input_ids == expected("A photo, of 1 mug!").input_ids
+    assert found.model_max_length == expected.model_max_length == 77
+
+
 @pytest.mark.parametrize("name", [*COMPONENTS])
 @pytest.mark.parametrize("how", ["folder", "file"])
 def test_a_missing_component_is_named(copy: Path, name: str, how: str) -> None:
