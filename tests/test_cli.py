@@ -24,6 +24,7 @@ from bigs.train.presets import PRESETS
     [
         "",
         "demo",
+        "doctor",
         "info",
         "preprocess",
         *(f"preprocess {step}" for step in ("all", "frames", "masks", "hands", "object", "align", "build")),
@@ -62,6 +63,7 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "export": "hand-meshes",
         "eval": "gt.npz",
         "batch": "finished ones are kept",
+        "doctor": "what that would enable",
         "view": "can be reached from this machine only",
         "info": "HANDS-challenge build folder",
         "prior": "sides that a clip never shows",

@@ -21,6 +21,7 @@ Commands = Mapping[str, "Callable[..., None] | Commands"]
 
 COMMANDS: Commands = {
     "demo": runs.demo,
+    "doctor": runs.doctor,
     "info": runs.info,
     "preprocess": {
         "all": preprocess.preprocess,

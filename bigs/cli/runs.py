@@ -44,6 +44,16 @@ Format = Literal[
 ]
 
 
+def doctor() -> None:
+    """Say what is installed here, what is missing, and what that would enable."""
+    from bigs.commands.doctor import examine
+
+    for heading, findings in examine():
+        say(f"{heading}:")
+        for finding in findings:
+            say(f"  {finding.state:8s}{finding.name:16s} {finding.detail}")
+
+
 def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0, seed: int = 0) -> None:
     """Make a little clip of two hands and a bottle, reconstruct it, and show how much better it became.
 

@@ -20,7 +20,7 @@ from bigs.commands.run_folder import PREVIEW_PICTURE, REPORT
 from bigs.commands.run_lock import only_writer
 from bigs.commands.series import Listener, PlannedRun, check_folders
 from bigs.commands.truth import find_ground_truth
-from bigs.metrics.report import METRICS as METRIC_NAMES
+from bigs.metrics.picture import ALL_METRICS
 from bigs.train.config import RunConfig
 from bigs.viewer.batch_page import PageRow, write_batch_page
 
@@ -28,7 +28,6 @@ SUMMARY_TABLE, SUMMARY_TEXT, SUMMARY_PAGE = "summary.csv", "summary.md", "index.
 
 # The scores that the table shows, those of the paper's tables; the CSV file has all.
 _SHOWN = ("mpjpe_ra_h", "cd_h_sq", "cd_icp_sq", "f10_icp", "psnr_foreground")
-_LABELS = {"psnr_foreground": "PSNR (dB)"}
 
 
 @dataclass(frozen=True)
@@ -150,9 +149,9 @@ def _work(plan: BatchPlan, engine: Engine, waiting: deque[Job], at_once: int, li
 def _summarise(plan: BatchPlan) -> list[tuple[str, ...]]:
     """Write the table as CSV and Markdown and the page; returns the table."""
     rows = [(run, read_status(run.folder)) for run in plan.runs]
-    keys = [key for key in (*METRIC_NAMES, *_LABELS) if any(key in status.scores for _, status in rows)]
+    keys = [key for key in ALL_METRICS if any(key in status.scores for _, status in rows)]
     shown = [key for key in _SHOWN if key in keys]
-    labels = [_LABELS.get(key) or f"{METRIC_NAMES[key].paper} ({METRIC_NAMES[key].unit})" for key in shown]
+    labels = [f"{ALL_METRICS[key].paper} ({ALL_METRICS[key].unit})" for key in shown]
     heading = ("clip", "state", "attempts", "seconds", *labels)
     table = [heading, *((_cells(run, status, shown)) for run, status in rows)]
     explained = [(*heading, "why")]

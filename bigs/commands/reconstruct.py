@@ -8,46 +8,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 import bigs
 from bigs.atomic import remove_parts
 from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
-from bigs.commands.formats import FPS, write_outputs
+from bigs.commands.formats import write_outputs
 from bigs.commands.pictures import frame_scores, means
-from bigs.commands.rendering import orbit_camera, render_frame, render_input_view
 from bigs.commands.run_folder import (
     CHECKPOINTS,
     CONFIG,
     LOG,
     METRICS,
-    PREVIEW_PICTURE,
-    PREVIEW_VIDEO,
-    REPORT,
     write_json,
 )
 from bigs.commands.run_lock import only_writer
 from bigs.commands.run_log import RunLog
+from bigs.commands.run_pictures import Told, write_pictures
 from bigs.commands.truth import load_truth
-from bigs.data.base import Clip
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.picture import ALL_METRICS
-from bigs.metrics.report import comparison_table, evaluate
-from bigs.models.playback import Playback, record
+from bigs.metrics.report import comparison_table, evaluate, per_frame
+from bigs.models.playback import record
 from bigs.train.checkpoint import FILE_NAME
 from bigs.train.config import RunConfig
 from bigs.train.config_file import save_config
 from bigs.train.fit import FitReport, check_plan, fit
 from bigs.train.initial import initial_trajectory
-from bigs.types import HandObjectTrajectory
-from bigs.viewer.preview import contact_sheet, overlay, save_picture, write_video
-from bigs.viewer.report import write_report
-
-# Degrees by which the preview's novel view is turned about the scene.
-_NOVEL_VIEW = 40.0
 
 
 @dataclass(frozen=True)
@@ -124,13 +113,17 @@ def reconstruct(
             playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)
-            result = _score(clip, playback, truth)
-            scores["result"] = result
+            frames = frame_scores(clip, playback)
+            scores["result"] = ({} if truth is None else evaluate(playback.trajectory(), truth)) | means(
+                frames
+            )
             for line in report.skipped:
                 log_and_listen({"event": "skipped", "text": line})
         write_json(out / METRICS, scores)
         table = comparison_table(scores, ALL_METRICS)
-        _write_preview(out, clip, playback, table, log.events, report)
+        if truth is not None:
+            frames |= per_frame(playback.trajectory(), truth)
+        write_pictures(out, clip, playback, Told(table, frames, log.events, report))
         return Outcome(out, table, report, report.before + time.perf_counter() - began)
 
 
@@ -142,72 +135,3 @@ def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None
         "clip": str(Path(clip_path).resolve()),
         "hand_model": None if hand_model is None else str(Path(hand_model).resolve()),
     }
-
-
-def _score(clip: Clip, playback: Playback, truth: HandObjectTrajectory | None) -> dict[str, float]:
-    """Image scores on the clip's own frames, and the pose and shape scores when there is a truth."""
-    scores = {} if truth is None else evaluate(playback.trajectory(), truth)
-    return scores | means(frame_scores(clip, playback))
-
-
-def _write_preview(
-    out: Path,
-    clip: Clip,
-    playback: Playback,
-    table: list[tuple[str, ...]],
-    log: list[dict[str, Any]],
-    report: FitReport,
-) -> None:
-    """A contact sheet, a video when PyAV is there, and the report around them."""
-    frames = [int(t) for t in np.linspace(0, len(clip) - 1, min(len(clip), 6)).round()]
-    rows: dict[str, list[np.ndarray]] = {"input": [], "render": [], "overlay": [], "turned 40°": []}
-    for t in frames:
-        color, alpha = render_input_view(playback, t)
-        novel, _ = _novel_view(playback, t)
-        for name, image in zip(
-            rows, (clip.image(t), color, overlay(color, alpha, clip.image(t)), novel), strict=True
-        ):
-            rows[name].append(image)
-    sheet = contact_sheet(rows, [f"frame {t}" for t in frames])
-    save_picture(out / PREVIEW_PICTURE, sheet)
-    video: Path | None = out / PREVIEW_VIDEO
-    try:
-        write_video(
-            out / PREVIEW_VIDEO,
-            (
-                np.concatenate(
-                    [clip.image(t) / 255.0, render_input_view(playback, t)[0], _novel_view(playback, t)[0]],
-                    axis=1,
-                )
-                for t in range(len(clip))
-            ),
-            FPS,
-        )
-    except InputError as missing:
-        report.skipped.append(f"{PREVIEW_VIDEO}: {missing}")
-        video = None
-    write_report(
-        out / REPORT,
-        title=f"{clip.name}: {len(clip)} frames",
-        facts={
-            "frames": f"{len(clip)}, {clip.width} x {clip.height}",
-            "subjects": ", ".join(playback.entities),
-            "Gaussians": str(playback.gaussians([0]).means.shape[1]),
-            **report.facts,
-        },
-        pictures={"input, render, render over input, turned": sheet},
-        video=video,
-        metrics=table,
-        log=[
-            {"stage": e["stage"], "step": e["step"], "loss": e["loss"], **e["terms"]}
-            for e in log
-            if e["event"] == "step"
-        ],
-        timings=report.seconds,
-        skipped=report.skipped,
-    )
-
-
-def _novel_view(playback: Playback, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    viewmat = orbit_camera(playback, frame, _NOVEL_VIEW)
-    return render_frame(playback, frame, viewmat, playback.K, playback.width, playback.height)

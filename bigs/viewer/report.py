@@ -18,6 +18,8 @@ from bigs.checks import InputError
 from bigs.viewer.plot import line_plot
 
 _JPEG_QUALITY = 88
+# Of the pictures under the slider, of which there are many.
+_FRAME_QUALITY = 75
 # Keys of a log row that say where it belongs and are no curves themselves.
 _POSITION_KEYS = ("stage", "step", "steps", "time")
 
@@ -30,12 +32,26 @@ figure { margin: 1em 0; } figcaption { opacity: .75; }
 table { border-collapse: collapse; } th, td { padding: .2em .9em; border-bottom: 1px solid #8886; }
 td { text-align: right; font-variant-numeric: tabular-nums; } th { text-align: right; }
 th:first-child, td:first-child { text-align: left; }
+#time { width: 100%; } .frame { width: 100%; }
 .curves { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 1em; }
 svg text { font: 10px system-ui, sans-serif; fill: currentColor; }
 svg .name { font-weight: bold; font-size: 12px; }
 svg path { fill: none; } svg .axis { stroke: currentColor; } svg .grid { stroke: #8883; }
 svg .border { stroke: #888; stroke-dasharray: 3 3; } svg .curve { stroke: #2a7de1; stroke-width: 1.5; }
 """
+
+_SLIDER_SCRIPT = """<script>
+{
+  const slider = document.getElementById("time"), moment = document.getElementById("moment");
+  const frames = [...document.querySelectorAll(".frame")];
+  slider.addEventListener("input", () => {
+    frames.forEach((frame, index) => { frame.hidden = index !== slider.valueAsNumber; });
+    moment.textContent = frames[slider.valueAsNumber].alt;
+  });
+  // Browsers keep a slider where it was when a page is loaded again.
+  slider.value = 0;
+}
+</script>"""
 
 
 def write_report(
@@ -44,8 +60,11 @@ def write_report(
     title: str,
     facts: Mapping[str, str] | None = None,
     pictures: Mapping[str, Image.Image] | None = None,
+    frames: Sequence[tuple[str, Image.Image]] = (),
     video: str | Path | None = None,
     metrics: Sequence[Sequence[str]] = (),
+    per_frame: Mapping[str, Sequence[float]] | None = None,
+    coverage: tuple[str, Image.Image] | None = None,
     log: Sequence[Mapping[str, Any]] = (),
     timings: Mapping[str, float] | None = None,
     skipped: Sequence[str] = (),
@@ -57,9 +76,12 @@ def write_report(
         title: its heading.
         facts: what the run was: name -> value.
         pictures: caption -> picture.
+        frames: caption -> picture of each time that the slider goes through.
         video: an .mp4 file, embedded as it is.
         metrics: a table of text, the first row its heading, as `bigs.metrics.report.comparison_table` makes
             it.
+        per_frame: name -> one number a frame; those that are not finite leave a gap.
+        coverage: what it shows -> the map of directions from which the object was seen.
         log: rows in the order they were logged: "stage" (text, optional), "step" (steps done in that stage),
             and numbers; dictionaries of numbers count as numbers of their own. Every number becomes a curve
             over all stages; what is neither is passed over.
@@ -75,14 +97,20 @@ def write_report(
     if metrics:
         parts += ["<h2>Scores</h2>", _table(metrics)]
     for caption, picture in (pictures or {}).items():
-        source = _embedded(_jpeg(picture), "image/jpeg")
-        name = escape(caption)
-        parts.append(f'<figure><img src="{source}" alt="{name}"><figcaption>{name}</figcaption></figure>')
+        parts.append(_figure(caption, picture))
+    if frames:
+        parts.append(_slider(frames))
     if video is not None:
         if not Path(video).is_file():
             raise InputError(f"{video}: expected a video for the report, found no such file")
         source = _embedded(Path(video).read_bytes(), "video/mp4")
         parts.append(f'<h2>Video</h2><video controls loop muted src="{source}"></video>')
+    errors = [line_plot(name, range(len(y)), y) for name, y in (per_frame or {}).items()]
+    if any(errors):
+        parts.append(f'<h2>Errors frame by frame</h2><div class="curves">{"".join(errors)}</div>')
+    if coverage is not None:
+        caption, picture = coverage
+        parts += ["<h2>Where the object was seen from</h2>", _figure(caption, picture)]
     curves = _curves(log)
     if curves:
         parts.append(f'<h2>Optimisation</h2><div class="curves">{"".join(curves)}</div>')
@@ -98,6 +126,25 @@ def write_report(
     )
     with atomic_write(path) as file:
         file.write(document.encode())
+
+
+def _figure(caption: str, picture: Image.Image) -> str:
+    name, source = escape(caption), _embedded(_jpeg(picture, _JPEG_QUALITY), "image/jpeg")
+    return f'<figure><img src="{source}" alt="{name}"><figcaption>{name}</figcaption></figure>'
+
+
+def _slider(frames: Sequence[tuple[str, Image.Image]]) -> str:
+    """Pictures of which one is shown, and a slider that says which; the arrow keys move it, too."""
+    pictures = "".join(
+        f'<img class="frame" src="{_embedded(_jpeg(picture, _FRAME_QUALITY), "image/jpeg")}" '
+        f'alt="{escape(caption)}"{" hidden" if index else ""}>'
+        for index, (caption, picture) in enumerate(frames)
+    )
+    return (
+        f"<h2>Frame by frame</h2><figure>{pictures}"
+        f'<input id="time" type="range" min="0" max="{len(frames) - 1}" value="0" aria-label="frame">'
+        f'<figcaption id="moment">{escape(frames[0][0])}</figcaption></figure>{_SLIDER_SCRIPT}'
+    )
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
@@ -148,9 +195,9 @@ def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
     return found
 
 
-def _jpeg(picture: Image.Image) -> bytes:
+def _jpeg(picture: Image.Image, quality: int) -> bytes:
     buffer = io.BytesIO()
-    picture.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    picture.convert("RGB").save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
 
 

@@ -1,6 +1,7 @@
 """The report is one well-formed file that asks for nothing outside itself."""
 
 import base64
+import io
 import re
 from html.parser import HTMLParser
 
@@ -12,7 +13,7 @@ from bigs.checks import InputError
 from bigs.viewer.plot import line_plot
 from bigs.viewer.report import write_report
 
-VOID = {"meta", "img", "br"}
+VOID = {"meta", "img", "br", "input"}
 
 
 class Page(HTMLParser):
@@ -42,6 +43,10 @@ class Page(HTMLParser):
         self.text.append(data)
 
 
+def plain(level):
+    return Image.fromarray(np.full((20, 60, 3), level, np.uint8))
+
+
 @pytest.fixture
 def report(tmp_path):
     video = tmp_path / "preview.mp4"
@@ -56,6 +61,9 @@ def report(tmp_path):
         facts={"preset": "fast"},
         pictures={"input & render": Image.fromarray(np.full((20, 30, 3), 90, np.uint8))},
         video=video,
+        frames=[(f"frame {t}", plain(40 * t)) for t in range(5)],
+        per_frame={"MPJPE (mm)": [5.0, float("nan"), 7.0], "nothing": [float("nan")] * 3},
+        coverage=("half of it", plain(7)),
         metrics=[("score", "unit", "initial", "result"), ("MPJPE_r", "mm", "21.25", "9.10")],
         log=log,
         timings={"hands": 30.0, "joint": 10.0},
@@ -70,11 +78,12 @@ def test_everything_is_in_it(report):
     for wanted in (
         *("mustard <b> & co", "preset", "fast", "MPJPE_r", "21.25", "9.10", "input & render"),
         *("30.0", "75 %", "40.0", "contact: no frame shows touch"),
+        *("frame 0", "MPJPE (mm)", "half of it"),
     ):
         assert wanted in text, wanted
     assert "b" not in page.tags
-    # mask, rgb and loss are numbers; notes and flags are not
-    assert page.tags.count("svg") == 3
+    # mask, rgb and loss are numbers; notes and flags are not. One score of each frame is a number.
+    assert page.tags.count("svg") == 4
     assert "ignored" not in text
 
 
@@ -82,7 +91,7 @@ def test_it_asks_for_nothing_outside_itself(report):
     sources = [
         value for _, name, value in Page(report).attributes if name in ("src", "href", "data", "poster")
     ]
-    assert len(sources) == 2
+    assert len(sources) == 1 + 5 + 1 + 1  # sheet, frames, map, video
     assert all(source.startswith("data:") for source in sources)
     assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", report)
     assert "@import" not in report
@@ -91,6 +100,10 @@ def test_it_asks_for_nothing_outside_itself(report):
 
 def test_picture_and_video_are_whole(report):
     sources = dict(re.findall(r'src="data:([a-z0-9/]+);base64,([^"]*)"', report))
+    shown = re.findall(r'class="frame" src="data:image/jpeg;base64,([^"]*)" alt="[^"]*"( hidden)?', report)
+    assert [bool(hidden) for _, hidden in shown] == [False, True, True, True, True]
+    levels = [np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))).mean() for data, _ in shown]
+    assert levels == pytest.approx([0, 40, 80, 120, 160], abs=2)
     assert base64.b64decode(sources["video/mp4"]) == b"not really a video"
     assert base64.b64decode(sources["image/jpeg"])[:3] == b"\xff\xd8\xff"
 
