@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import importlib.util
 import io
+import json
+import re
 import subprocess
 import sys
 import zipfile
@@ -53,6 +55,7 @@ def test_every_example_has_a_test_a_purpose_and_a_main() -> None:
         "gsplat_script",
         "reconstruct_arctic",
         "reconstruct_ho3d",
+        "reconstruct_video",
         "novel_pose",
     }
     for name in names:
@@ -134,6 +137,21 @@ def test_reconstruct_ho3d(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "mpjpe_ra_l" not in scores and 0 < scores["mpjpe_ra_r"] < 40
     assert len(load_hold(tmp_path / "ho3d" / "clips" / "SYN1_limited")) == 4
     assert "SYN1_limited" in (tmp_path / "ho3d" / "comparison.md").read_text()
+
+
+@pytest.mark.slow
+def test_reconstruct_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example = load("reconstruct_video")
+    run = example.main(tmp_path / "video")
+    text = capsys.readouterr().out
+    for step in ("frames", "masks", "hands", "object", "align", "build"):
+        assert re.search(rf"^{step} +made: ", text, re.M), text
+    clip = load_hold(tmp_path / "video" / "clip")
+    assert set(clip.hands) == {"right", "left"} and clip.object is not None and len(clip) == 16
+    scores = json.loads((run / "metrics.json").read_text())["result"]
+    assert scores["mpjpe_ra_h"] < 25 and scores["cd_icp_sq"] < 2 and scores["psnr_foreground"] > 8
+    with pytest.raises(InputError, match="expected --masks and --keypoints with a video"):
+        example.main(tmp_path / "other", video=tmp_path / "video.mp4")
 
 
 @pytest.mark.slow
