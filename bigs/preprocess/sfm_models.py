@@ -205,7 +205,11 @@ def _refine(reconstruction: pycolmap.Reconstruction, known_focal: bool, config: 
         manager.filter_points3D_with_short_tracks(3)
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return
-        pycolmap.bundle_adjustment(reconstruction, options)
+        problem = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            problem.add_image(image_id)
+        problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, problem, reconstruction).solve()
         pycolmap.ObservationManager(reconstruction).filter_all_points3D(config.keep_error, config.keep_angle)
 
 
