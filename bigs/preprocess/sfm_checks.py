@@ -27,14 +27,14 @@ class CheckConfig:
     # Fewer sightings than this do not make a pose; the motion does.
     least_sightings: int = 8
     # A standard deviation of the rotation that the observations alone leave open, degrees.
-    most_uncertain: float = 1.5
+    most_uncertain: float = 1.0
     # Cosine between the mean angular velocities of the five frames before and after.
     least_cosine: float = 0.8
     # A step that is longer than this many usual ones, and than this angle, degrees.
     long_step: float = 2.0
     least_long_step: float = 8.0
-    # The mirror image in depth fits nearly as well as this share of the pose's own misfit says.
-    mirror_share: float = 1.0
+    # Misfit over that of the mirror image in depth. Right segments reached 0.97 where little was seen.
+    mirror_share: float = 0.975
     # Frames that are compared with their mirror image together, half of them with the next ones too.
     mirror_window: int = 20
 
