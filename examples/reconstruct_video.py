@@ -56,7 +56,7 @@ def main(
     focal: float | None = None,
     hand_model: Path | None = None,
     preset: Literal["smoke", "fast", "full", "paper"] = "smoke",
-    frames: int = 16,
+    frames: int = 20,
 ) -> Path:
     """Make a clip of a video and reconstruct it.
 

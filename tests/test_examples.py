@@ -147,7 +147,7 @@ def test_reconstruct_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     for step in ("frames", "masks", "hands", "object", "align", "build"):
         assert re.search(rf"^{step} +made: ", text, re.M), text
     clip = load_hold(tmp_path / "video" / "clip")
-    assert set(clip.hands) == {"right", "left"} and clip.object is not None and len(clip) == 16
+    assert set(clip.hands) == {"right", "left"} and clip.object is not None and len(clip) == 20
     scores = json.loads((run / "metrics.json").read_text())["result"]
     assert scores["mpjpe_ra_h"] < 25 and scores["cd_icp_sq"] < 2 and scores["psnr_foreground"] > 8
     with pytest.raises(InputError, match="expected --masks and --keypoints with a video"):
