@@ -9,18 +9,15 @@ import torch
 from torch import Tensor
 
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from bigs.hand import MANO_PARENTS, mirror_axis_angle, mirror_points, skin_points
+from bigs.hand import JOINT_NAMES, MANO_PARENTS, mirror_axis_angle, mirror_points, skin_points
 from bigs.hand.lbs import forward_kinematics
 from bigs.models.playback import HandPlayback, ObjectPlayback
 from bigs.types import Side
 
 # The three joints of each finger within `hand_pose`, from the knuckle out.
-FINGERS: dict[str, tuple[int, int, int]] = {
-    "thumb": (12, 13, 14),
-    "index": (0, 1, 2),
-    "middle": (3, 4, 5),
-    "ring": (9, 10, 11),
-    "pinky": (6, 7, 8),
+FINGERS: dict[str, tuple[int, ...]] = {
+    finger: tuple(JOINT_NAMES.index(f"{finger}{i}") - 1 for i in (1, 2, 3))
+    for finger in ("thumb", "index", "middle", "ring", "pinky")
 }
 
 

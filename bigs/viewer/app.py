@@ -24,6 +24,7 @@ _FRUSTUM_DEPTH = 4.0  # centimetres
 # Where the page's camera starts: beside and behind the clip's own and looking a little in front of the scene,
 # so that both scene and frustum are in sight.
 _START_TURN, _START_DISTANCE, _START_PULL, _START_FOV = 15.0, 1.4, 0.15, 50.0
+_LAST_PORT = 65535
 _AS_RECONSTRUCTED, _BY_SUBJECT = "as reconstructed", "by subject"
 
 
@@ -44,7 +45,7 @@ class Viewer:
             raise InputError(
                 "live viewer: expected the extra 'viewer' (pip install 'bigs[viewer]'), found no viser"
             ) from error
-        _check_address(host)
+        _check_address(host, port)
         # It would print a box with its address.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host=host, port=port, label=stage.title, verbose=False)
@@ -254,8 +255,10 @@ class Viewer:
             self._frustum.image = image
 
 
-def _check_address(host: str) -> None:
+def _check_address(host: str, port: int) -> None:
     """Refuse an address that is not this machine's; the server would try every port of it in vain."""
+    if not 0 <= port <= _LAST_PORT:
+        raise InputError(f"port: expected a number from 0 to {_LAST_PORT}, found {port}")
     try:
         with socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
             pass
