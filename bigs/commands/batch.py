@@ -139,10 +139,12 @@ def _work(plan: BatchPlan, engine: Engine, waiting: deque[Job], at_once: int, li
             if death or status.state != "failed":
                 error = death or "its worker ended without a word"
                 status = replace(status, state="failed", error=error, again=True, batch=job.batch)
-                job.run.folder.mkdir(parents=True, exist_ok=True)
-                write_status(job.run.folder, replace(status, attempts=tries[job.name]))
+                status = replace(status, attempts=tries[job.name])
             if status.again and tries[job.name] <= plan.retries:
+                status = replace(status, state="waiting")
                 waiting.append(job)
+            job.run.folder.mkdir(parents=True, exist_ok=True)
+            write_status(job.run.folder, status)
         _summarise(plan)
 
 

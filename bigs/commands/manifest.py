@@ -87,7 +87,18 @@ def _rows(path: Path, text: str) -> Sequence[Any]:
             raise InputError(f"{path}: defaults: expected fields and values, found {defaults!r}")
     if not isinstance(document, list):
         raise InputError(f"{path}: expected a list of clips, found {type(document).__name__}")
-    return [{**defaults, **(row if isinstance(row, dict) else {"clip": row})} for row in document]
+    return [_with_defaults(defaults, row if isinstance(row, dict) else {"clip": row}) for row in document]
+
+
+def _with_defaults(defaults: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row's own values count; lists of settings add up, the row's last."""
+    both = {**defaults, **row}
+    for key in _LISTS:
+        parts = [values[key] for values in (defaults, row) if key in values]
+        parts = [part.split(_SEPARATOR) if isinstance(part, str) else part for part in parts]
+        if len(parts) == 2 and all(isinstance(part, list) for part in parts):
+            both[key] = [*parts[0], *parts[1]]
+    return both
 
 
 def _entry(where: str, row: Any, folder: Path) -> Entry:

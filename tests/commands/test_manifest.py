@@ -60,6 +60,13 @@ def test_defaults_give_way_to_entries(tmp_path: Path) -> None:
     assert first.gt == second.gt == tmp_path / "t.npz"
 
 
+def test_settings_of_defaults_and_entries_add_up(tmp_path: Path) -> None:
+    text = "defaults: {set: [seed=1, lighting=false]}\nclips:\n- a\n- {clip: b, set: seed=2}\n"
+    first, second = read_manifest(written(tmp_path, "m.yaml", text))
+    assert first.set == ("seed=1", "lighting=false")
+    assert second.set == ("seed=1", "lighting=false", "seed=2")  # the last one counts
+
+
 def test_names_do_not_repeat(tmp_path: Path) -> None:
     text = "- x/clip\n- y/clip\n- {clip: z/clip, name: clip}\n- {clip: strange name!}\n"
     names = [entry.name for entry in read_manifest(written(tmp_path, "m.yaml", text))]
