@@ -127,7 +127,8 @@ def find_clip(
         keypoints=keypoints / f"{name}.json",
         hand_model=hand_model,
     )
-    preprocess(request, listen=print)
+    for step in preprocess(request):
+        print(f"{step.name:7s} {step.state}: {step.summary}")
     return made
 
 

@@ -19,8 +19,12 @@ from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.paper_tables import beside_paper
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_annotation
-from bigs.data.writers import write_arctic
+from bigs.data.ho3d import CV_FROM_GL
+from bigs.data.moving import in_world
+from bigs.data.writers import write_arctic, write_ho3d
+from bigs.hand import HandModel
 from bigs.metrics.picture import ALL_METRICS
+from bigs.types import Side
 
 pytestmark = pytest.mark.slow
 
@@ -66,6 +70,38 @@ def test_arctics_layout_is_the_same_truth(run: Path, tiny: Clip, tiny_clip: Path
     assert "the data set's poses are on the built-in hand" in found.remarks[0]
     for key, value in own.items():
         assert other[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
+
+
+def test_ho3ds_truth_has_one_hand_and_knows_some_frames(
+    run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path, both_hands: dict[Side, HandModel]
+) -> None:
+    own = evaluate_run(run, EvaluationPlan())
+    annotation = load_annotation(tiny_clip)
+    rest = {}
+    for side, track in annotation.hands.items():
+        betas = torch.as_tensor(track.betas, dtype=torch.float32)
+        rest[side] = both_hands[side].rest_joints(betas)[0].double().numpy()
+    annotation = in_world(annotation, CV_FROM_GL, rest)
+    assert annotation.object is not None
+    annotation.object.valid[[3, 4]] = False
+    folder = write_ho3d(
+        tmp_path / "ho3d",
+        annotation,
+        clip="SM1",
+        object_name="bottle",
+        images=[tiny.image(t) for t in range(len(tiny))],
+        hands_mean=np.asarray(both_hands["right"].hands_mean),
+    )
+    # HO-3D writes four digits; the clip was made with five.
+    for part, suffix in (("meta", "pkl"), ("rgb", "jpg")):
+        for t in range(len(tiny)):
+            (folder / part / f"{t:04d}.{suffix}").rename(folder / part / f"{t:05d}.{suffix}")
+    found = evaluate_run(run, EvaluationPlan(ground_truth=folder))
+    assert "mpjpe_ra_l" not in found.frames and np.isnan(found.frames["mpjpe_ra_r"][[3, 4]]).all()
+    known = [t for t in range(len(tiny)) if t not in (3, 4)]
+    for key in ("mpjpe_ra_r", "cd_r_sq", "mrrpe_r"):
+        np.testing.assert_allclose(found.frames[key][known], own.frames[key][known], rtol=1e-3)
+        assert found.scores["result"][key] == pytest.approx(own.frames[key][known].mean(), rel=1e-3)
 
 
 def test_a_data_sets_truth_is_on_its_own_hands(
