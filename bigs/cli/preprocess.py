@@ -65,18 +65,33 @@ class HandOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class ObjectOptions:
+    """How the object's motion is found."""
+
+    disk: Path | None = None
+    """File of DISK's weights, to find features with instead of SIFT."""
+    lightglue: Path | None = None
+    """File of LightGlue's weights for DISK, to match them with."""
+    exhaustive: bool = False
+    """Match every pair of frames, not only the next ten: slower, and look-alike sides may be mistaken."""
+
+
+@dataclasses.dataclass(frozen=True)
 class VideoOptions:
     """Everything that preprocessing needs beside the pictures."""
 
     frames: Annotated[FrameOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FrameOptions)
     masks: Annotated[MaskOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=MaskOptions)
     hands: Annotated[HandOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=HandOptions)
+    object: Annotated[ObjectOptions, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=ObjectOptions
+    )
 
     def given(self) -> list[str]:
         """The options that the user set, as they are written."""
         return [
             f"--{option.name.replace('_', '-')}"
-            for group in (self.frames, self.masks, self.hands)
+            for group in (self.frames, self.masks, self.hands, self.object)
             for option in dataclasses.fields(group)
             if getattr(group, option.name) != option.default
         ]
@@ -146,16 +161,22 @@ def masks(
     _run(_request(clip, None, chosen, None, redo), ("masks",))
 
 
-def object_motion(clip: Clip, redo: bool = False, threads: int = 0) -> None:
+def object_motion(
+    clip: Clip,
+    options: Annotated[ObjectOptions, Flat] = ObjectOptions(),
+    redo: bool = False,
+    threads: int = 0,
+) -> None:
     """Step 3: the object's motion and points, by structure from motion within its mask.
 
     Args:
         clip: the clip folder.
+        options: features and pairs.
         redo: make it anew though it is up to date.
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    _run(_request(clip, None, VideoOptions(), None, redo), ("object",))
+    _run(_request(clip, None, VideoOptions(object=options), None, redo), ("object",))
 
 
 def hands(
@@ -236,6 +257,7 @@ def _request(
         **masks,
         mask_labels=_labels(labels) if labels else None,
         **dataclasses.asdict(options.hands),
+        **dataclasses.asdict(options.object),
         hand_model=hand_model,
         redo=redo,
     )

@@ -38,6 +38,8 @@ from bigs.preprocess.artefacts import (
 )
 from bigs.preprocess.hands import joints_of_track
 from bigs.preprocess.sfm import SfmConfig, SfmReport, structure_from_motion
+from bigs.preprocess.sfm_learned import load_matcher
+from bigs.preprocess.sfm_models import MappingConfig
 from bigs.types import Side
 
 # What structure from motion has to say of every frame.
@@ -54,21 +56,25 @@ def object_step(request: PreprocessRequest, listen: Callable[[str], None]) -> St
     frames = read_frame_set(processed)
     count = len(frames.names)
     file, picture, report_file = processed / SFM_FILE, processed / "object.png", processed / SFM_REPORT
-    config = SfmConfig()
-    state = request.state(file, _object_inputs(processed, frames, config))
+    config = SfmConfig(mapping=MappingConfig(pairs="exhaustive" if request.exhaustive else "sequential"))
+    weights = _weights(request)
+    state = request.state(file, _object_inputs(processed, frames, config, weights))
     if state in ("current", "supplied"):
         stored = _stored_notes(report_file) if state == "current" else ()
         summary = _object_summary(read_object_sfm(file, count))
         return _kept("object", state, summary, stored, picture)
+    matcher = load_matcher(*weights) if weights else None
     listen("finding features")
     labels = _labels(processed, frames)
     images = [read_image(path) for path in frame_paths(processed, frames)]
-    found, report = structure_from_motion(images, labels, frames.K, config, known_focal=frames.focal_known)
+    found, report = structure_from_motion(
+        images, labels, frames.K, config, known_focal=frames.focal_known, matcher=matcher
+    )
     notes = report.sentences()
     if not frames.focal_known:
         frames, note = _with_focal(processed, frames, report.focal)
         notes.append(note)
-    inputs = _object_inputs(processed, frames, config)
+    inputs = _object_inputs(processed, frames, config, weights)
     write_json(report_file, _report_table(report) | {"notes": notes}, inputs)
     write_object_sfm(file, found, inputs)
     _draw_object(picture, processed, frames, found)
@@ -111,9 +117,20 @@ def align_step(request: PreprocessRequest, listen: Callable[[str], None]) -> Ste
     return StepOutcome("align", "made", _alignment_summary(found, sfm), report.notes, picture)
 
 
-def _object_inputs(processed: Path, frames: FrameSet, config: SfmConfig) -> str:
+def _weights(request: PreprocessRequest) -> tuple[Path, ...]:
+    """The files of DISK and LightGlue, or none."""
+    if request.disk is None and request.lightglue is None:
+        return ()
+    if request.disk is None or request.lightglue is None:
+        missing = "--disk" if request.disk is None else "--lightglue"
+        raise InputError(f"learned features: expected --disk FILE and --lightglue FILE, found no {missing}")
+    return request.disk, request.lightglue
+
+
+def _object_inputs(processed: Path, frames: FrameSet, config: SfmConfig, weights: tuple[Path, ...]) -> str:
+    pictures = frame_paths(processed, frames)
     return content_digest(
-        *frame_paths(processed, frames), processed / MASKS, frames.K, frames.focal_known, asdict(config)
+        *pictures, processed / MASKS, *weights, frames.K, frames.focal_known, asdict(config)
     )
 
 

@@ -30,6 +30,9 @@ class PreprocessRequest:
     keypoints: Path | None = None
     hands: Path | None = None  # what another hand estimator wrote
     landmarker: Path | None = None  # MediaPipe's model file
+    disk: Path | None = None  # weights of DISK, to be used instead of SIFT
+    lightglue: Path | None = None  # weights of LightGlue for DISK
+    exhaustive: bool = False  # match every pair of frames
     hand_model: Path | None = None
     redo: bool = False
 

@@ -14,7 +14,8 @@ from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
 from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_features
 from bigs.preprocess.sfm_grow import GrowConfig, grow, polish
-from bigs.preprocess.sfm_models import Mapping, MappingConfig, map_features
+from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
+from bigs.preprocess.sfm_models import Mapping, MappingConfig, frame_pairs, map_features
 from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
 from bigs.preprocess.sfm_seed import Seed, find_seed
 from bigs.preprocess.tracks import Tracks, join_matches
@@ -71,6 +72,7 @@ def structure_from_motion(
     config: SfmConfig,
     *,
     known_focal: bool = True,
+    matcher: LearnedMatcher | None = None,
 ) -> tuple[ObjectSfm, SfmReport]:
     """Poses of the object in all frames, and its points.
 
@@ -84,6 +86,7 @@ def structure_from_motion(
         config: see there.
         known_focal: whether the focal length in `K` is right; if not, it is estimated, and `report.focal`
             is what the poses go with.
+        matcher: learned features instead of SIFT (see `sfm_learned`).
 
     Returns:
         The poses, in structure from motion's own unit, and the report. Frames that the object cannot be
@@ -101,9 +104,14 @@ def structure_from_motion(
     first, last = int(shown[0]), int(shown[-1]) + 1
     clip = slice(first, last)
     object_masks = masks[clip] == MASK_VALUES["object"]
-    features = extract_features(images[clip], object_masks, config.features)
     size = (masks.shape[2], masks.shape[1])
-    mapping = _map(features, K, size, known_focal, config.mapping)
+    candidates = None
+    if matcher is None:
+        features = extract_features(images[clip], object_masks, config.features)
+    else:
+        features = extract_learned(images[clip], object_masks, matcher, config.features)
+        candidates = match_learned(features, frame_pairs(len(features), config.mapping), size, matcher)
+    mapping = _map(features, K, size, known_focal, config.mapping, candidates)
     K = K.copy()
     K[0, 0], K[1, 1] = mapping.focal, mapping.focal * K[1, 1] / K[0, 0]
     tracks = join_matches(mapping.matches, [len(frame.pixels) for frame in features])
@@ -129,11 +137,12 @@ def _map(
     size: tuple[int, int],
     known_focal: bool,
     config: MappingConfig,
+    candidates: dict[tuple[int, int], np.ndarray] | None,
 ) -> Mapping:
     """Partial models; with loosened thresholds when the usual ones give none, since the best is checked."""
-    mapping = map_features(features, K, size, known_focal, config)
+    mapping = map_features(features, K, size, known_focal, config, candidates)
     if not mapping.models:
-        mapping = map_features(features, K, size, known_focal, config.loosened())
+        mapping = map_features(features, K, size, known_focal, config.loosened(), candidates)
     if not mapping.models:
         counts = [len(frame.pixels) for frame in features]
         matches = _neighbour_matches(mapping, len(features))[:-1]

@@ -69,13 +69,12 @@ def extract_features(
     Returns:
         One entry per frame, without features where the mask is empty.
     """
-    boxes = [_box(mask) for mask in masks]
-    largest = max((max(box[1] - box[0], box[3] - box[2]) for box in boxes if box is not None), default=1)
-    scale = min(config.upscale, config.max_side / largest)
+    boxes = [crop_box(mask) for mask in masks]
+    scale = enlargement(boxes, config)
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features = config.max_features
     options.sift.peak_threshold = config.peak_threshold
-    features = [_NOTHING] * len(images)
+    features = [NOTHING] * len(images)
     # pycolmap uses all cores only on files.
     with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder, quiet_colmap():
         crops = {}
@@ -103,10 +102,16 @@ def extract_features(
     return features
 
 
-_NOTHING = FrameFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
+NOTHING = FrameFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
 
 
-def _box(mask: np.ndarray) -> tuple[int, int, int, int] | None:
+def enlargement(boxes: Sequence[tuple[int, int, int, int] | None], config: FeatureConfig) -> float:
+    """By what all crops are enlarged, so that the largest keeps within bounds."""
+    largest = max((max(box[1] - box[0], box[3] - box[2]) for box in boxes if box is not None), default=1)
+    return min(config.upscale, config.max_side / largest)
+
+
+def crop_box(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     """Top, bottom, left, right of a mask's true pixels, with a margin; None when there are none."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if rows.size == 0:

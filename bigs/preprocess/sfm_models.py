@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -18,7 +18,9 @@ from bigs.preprocess.sfm_features import FrameFeatures, quiet_colmap
 class MappingConfig:
     """Matching and incremental mapping; lengths in pixels are of the clip's images."""
 
-    # Each frame is matched with this many later ones; far pairs invite look-alike sides to be taken for one.
+    # Each frame is matched with this many later ones, or with all: far pairs invite look-alike sides to be
+    # taken for one.
+    pairs: Literal["sequential", "exhaustive"] = "sequential"
     overlap: int = 10
     # How far a match may lie from its epipolar line, and a point from its pixel while a frame is added.
     match_error: float = 1.5
@@ -72,6 +74,7 @@ def map_features(
     size: tuple[int, int],
     known_focal: bool,
     config: MappingConfig,
+    candidates: dict[tuple[int, int], np.ndarray] | None = None,
 ) -> Mapping:
     """Match neighbouring frames and build models from them.
 
@@ -81,11 +84,13 @@ def map_features(
         size: width and height of the images.
         known_focal: whether the focal length in `K` is to be believed or is only a first guess.
         config: see there.
+        candidates: matches of pairs of frames that were found already and are only to be verified; without
+            them, descriptors are SIFT's and are matched here.
     """
     with tempfile.TemporaryDirectory(prefix="bigs-sfm-") as folder, quiet_colmap():
         file = Path(folder) / "clip.db"
-        _write_database(file, features, K, size, known_focal)
-        _match(file, config)
+        _write_database(file, features, K, size, known_focal, candidates is None)
+        _match(file, config, candidates)
         matches = _verified_matches(file)
         (Path(folder) / "models").mkdir()
         found = pycolmap.incremental_mapping(
@@ -109,6 +114,7 @@ def _write_database(
     K: np.ndarray,
     size: tuple[int, int],
     known_focal: bool,
+    describe: bool,
 ) -> None:
     camera = pycolmap.Camera(
         model="PINHOLE",
@@ -131,6 +137,7 @@ def _write_database(
             database.write_frame(entry, use_frame_id=True)
             if len(frame.pixels):
                 database.write_keypoints(t + 1, frame.pixels.astype(np.float32))
+            if describe and len(frame.pixels):
                 database.write_descriptors(
                     t + 1,
                     pycolmap.FeatureDescriptors(
@@ -139,21 +146,53 @@ def _write_database(
                 )
 
 
-def _match(file: Path, config: MappingConfig) -> None:
-    pairing = pycolmap.SequentialPairingOptions(
-        overlap=config.overlap, quadratic_overlap=False, loop_detection=False
-    )
+def frame_pairs(frames: int, config: MappingConfig) -> list[tuple[int, int]]:
+    """The pairs of frames that are matched."""
+    reach = config.overlap if config.pairs == "sequential" else frames
+    return [(a, b) for a in range(frames) for b in range(a + 1, min(a + 1 + reach, frames))]
+
+
+def _match(file: Path, config: MappingConfig, candidates: dict[tuple[int, int], np.ndarray] | None) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = config.pair_inliers
     verification.ransac.max_error = config.match_error
     verification.ransac.random_seed = config.seed
+    if candidates is not None:
+        _verify(file, candidates, verification)
+        return
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
+    device = pycolmap.Device.cpu
+    if config.pairs == "exhaustive":
+        pycolmap.match_exhaustive(
+            file, matching_options=matching, verification_options=verification, device=device
+        )
+        return
+    pairing = pycolmap.SequentialPairingOptions(
+        overlap=config.overlap, quadratic_overlap=False, loop_detection=False
+    )
     pycolmap.match_sequential(
         file,
-        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+        matching_options=matching,
         pairing_options=pairing,
         verification_options=verification,
-        device=pycolmap.Device.cpu,
+        device=device,
     )
+
+
+def _verify(
+    file: Path,
+    candidates: dict[tuple[int, int], np.ndarray],
+    verification: pycolmap.TwoViewGeometryOptions,
+) -> None:
+    names = []
+    with pycolmap.Database.open(file) as database:
+        for (a, b), matches in candidates.items():
+            if len(matches):
+                database.write_matches(a + 1, b + 1, matches.astype(np.uint32))
+                names.append(f"{a:06d}.png {b:06d}.png\n")
+    pairs = file.with_name("pairs.txt")
+    pairs.write_text("".join(names))
+    pycolmap.verify_matches(file, pairs, verification)
 
 
 def _verified_matches(file: Path) -> dict[tuple[int, int], np.ndarray]:
