@@ -56,6 +56,7 @@ def write_format(folder: Path, playback: Playback, name: str, choice: Choice = C
             that is not installed.
     """
     check_choice("format", name, FORMATS)
+    choice = choice or Choice()
     if choice.frames is not None:
         if name not in OF_FRAMES:
             raise InputError(f"frames: expected one of the formats {', '.join(OF_FRAMES)}, found {name}")
