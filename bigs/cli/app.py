@@ -41,7 +41,7 @@ COMMANDS: Commands = {
     "view": runs.view,
     "batch": batch.batch,
     "ablate": runs.ablate,
-    "prior": {"fit": prior.prior_fit},
+    "prior": {"fit": prior.prior_fit, "train": prior.prior_train},
     "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},
 }
 # What the help says of commands that have commands of their own.

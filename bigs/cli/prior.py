@@ -1,4 +1,4 @@
-"""Commands for the diffusion prior: prior fit."""
+"""Commands for the diffusion prior: prior fit, prior train."""
 
 from __future__ import annotations
 
@@ -76,3 +76,46 @@ def prior_fit(
     say(f"{found.steps} steps on {found.frames} frames, mean loss at the end {found.loss:.4f}")
     say(f"memory: {found.peak_gib:.1f} GiB at most, {found.weights_gib:.1f} GiB of it weights")
     say(f"the word {token} is in {found.path}")
+
+
+def prior_train(
+    meshes: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    steps: int = 20_000,
+    batch: int = 32,
+    lr: float = 4e-4,
+    views: int = 32,
+    width: int = 96,
+    up: Literal["x", "y", "z"] = "z",
+    seed: int = 0,
+    device: Device = "auto",
+    resume: bool = False,
+    threads: int = 0,
+) -> None:
+    """Train a small prior on renderings of a folder of meshes, for reconstruct --prior-weights.
+
+    Args:
+        meshes: folder of .ply, .obj, .glb, .stl or .off files, of any size.
+        out: the .safetensors file to write, 10 MB.
+        steps: how long to learn.
+        batch: pictures in a step.
+        lr: learning rate.
+        views: pictures of each mesh.
+        width: channels of the network; 96 makes 2.6 million parameters.
+        up: the meshes' axis that points up.
+        seed: of all that is drawn.
+        device: auto takes a GPU if there is one.
+        resume: go on from where an interrupted call was.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.prior_train import PixelConfig, PixelTrainingConfig, train_prior
+    from bigs.commands.progress import steps_listener
+
+    config = PixelTrainingConfig(steps, batch, lr, seed, net=PixelConfig(width))
+    with steps_listener(stderr, "learning from meshes") as listen:
+        found = train_prior(
+            meshes, out, config, views=views, up=up, device=device, resume=resume, listen=listen
+        )
+    say(f"{found.steps} steps on {found.pictures} pictures of {found.meshes} meshes, loss {found.loss:.4f}")
+    say(f"a prior of {found.parameters / 1e6:.2f} million parameters is in {found.path}")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from bigs.commands.reconstruct import Outcome
 
 # "auto", or the names of `train.config.PriorKind`; a test compares.
-Prior = Literal["auto", "off", "symmetry"]
+Prior = Literal["auto", "off", "symmetry", "trained", "sd"]
 
 # The names of `commands.formats.FORMATS`; a test compares.
 Format = Literal[
@@ -99,6 +99,11 @@ def reconstruct(
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     perceptual_weights: tuple[Path, ...] = (),
     prior: Prior = "auto",
+    prior_weights: str = "",
+    prior_object: str = "object",
+    prior_controlnet: str = "",
+    prior_token: str = "",
+    prior_edge_weights: str = "",
     threads: int = 0,
     video: Annotated[VideoOptions, tyro.conf.arg(name="")] = NO_VIDEO,
 ) -> None:
@@ -119,11 +124,18 @@ def reconstruct(
         perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
             "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
         prior: what completes the object where no frame shows it: off, symmetry (if there is strong evidence
-            for one), or auto, which is what the preset says (symmetry in all but paper).
+            for one), trained or sd (symmetry, and where there is none a diffusion model), or auto: what the
+            weights are for; without any, what the preset says (off in smoke and paper, symmetry elsewhere).
+        prior_weights: a file of bigs prior train, or Stable Diffusion 1.5 or 2.1: a folder or its hub name.
+        prior_object: what the object is, for Stable Diffusion, as in "mustard bottle".
+        prior_controlnet: a soft-edge ControlNet for it, a folder or a hub name.
+        prior_token: the object's learned word, a file of bigs prior fit.
+        prior_edge_weights: PiDiNet (table5_pidinet.pth) for the ControlNet; a built-in filter without it.
         threads: CPU threads; 0 takes all.
         video: what preprocessing needs, when the clip is a video or a folder of images.
     """
     use_threads(threads)
+    from bigs.commands.prior_weights import with_prior
     from bigs.commands.progress import progress_listener
     from bigs.commands.reconstruct import reconstruct as run
     from bigs.train.switches import without_all
@@ -133,8 +145,13 @@ def reconstruct(
         files = tuple(str(path.resolve()) for path in perceptual_weights)
         settings = dataclasses.replace(settings, perceptual_weights=files)
     clip = clip_of(clip, out, video, hand_model)
-    if prior != "auto":
-        settings = dataclasses.replace(settings, prior=dataclasses.replace(settings.prior, kind=prior))
+    given = {
+        "weights": prior_weights,
+        "controlnet": prior_controlnet,
+        "token": prior_token,
+        "edge_weights": prior_edge_weights,
+    }
+    settings = with_prior(settings, prior, prior_object, given)
     with progress_listener(stderr, settings) as listen:
         outcome = run(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from bigs.train.config import OptimizeStage, RunConfig
+from bigs.train.config import GuidanceStage, OptimizeStage, RunConfig
 
 
 @contextmanager
@@ -18,12 +18,15 @@ def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[
 
     The bar counts pixels times frames times steps, which is what time goes with, not steps alone.
     """
+    guided = config.prior.kind in ("trained", "sd")
+    stages = [stage for stage in config.stages if guided or not isinstance(stage, GuidanceStage)]
     cost = {
         stage.name: (stage.image_size or 480) ** 2 * (stage.frames_per_step or 60)
-        for stage in config.stages
+        for stage in stages
         if isinstance(stage, OptimizeStage)
     }
-    total = sum(cost[stage.name] * stage.steps for stage in config.stages if isinstance(stage, OptimizeStage))
+    cost |= {s.name: s.image_size**2 * s.views for s in stages if isinstance(s, GuidanceStage)}
+    total = sum(cost[stage.name] * getattr(stage, "steps", 0) for stage in stages if stage.name in cost)
     progress = _bar(console)
     task = progress.add_task("start values", total=total, detail="")
     done = 0.0
@@ -35,8 +38,7 @@ def progress_listener(console: Console, config: RunConfig) -> Iterator[Callable[
         if event["event"] == "stage":
             place = f"{event['index'] + 1}/{event['stages']}"
             done = sum(
-                cost.get(stage.name, 0) * getattr(stage, "steps", 0)
-                for stage in config.stages[: event["index"]]
+                cost.get(stage.name, 0) * getattr(stage, "steps", 0) for stage in stages[: event["index"]]
             )
             progress.update(task, description=f"{place} {event['stage']}", detail="", completed=done)
         elif event["event"] == "step":

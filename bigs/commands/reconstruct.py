@@ -16,6 +16,7 @@ from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
 from bigs.commands.formats import write_outputs
 from bigs.commands.pictures import frame_scores, means
+from bigs.commands.prior_weights import load_prior
 from bigs.commands.run_folder import (
     CHECKPOINTS,
     CONFIG,
@@ -82,6 +83,7 @@ def reconstruct(
     clip = open_estimates(clip_path, hand_models)
     files = [Path(path) for path in config.perceptual_weights]
     network = load_perceptual_weights(files) if files else None
+    denoiser = load_prior(config.prior)
     truth = None if ground_truth is None else load_truth(ground_truth, clip.frame_names, hand_models)
     if (out / CONFIG).exists() and not resume:
         raise InputError(f"{out}: expected a new run folder, found a run (pass --resume to continue it)")
@@ -106,6 +108,7 @@ def reconstruct(
                 hand_models,
                 config,
                 perceptual=network,
+                denoiser=denoiser,
                 checkpoints=out / CHECKPOINTS,
                 resume=resume,
                 listen=log_and_listen,

@@ -20,7 +20,7 @@ from bigs.types import SIDES, Entity, Gaussians, Side
 
 @dataclass(frozen=True)
 class ObjectSurface:
-    """The object's initial surface in its own frame, metres at the initial size."""
+    """The object's surface in its own frame, metres at the initial size."""
 
     verts: Tensor  # [V, 3]
     faces: Tensor  # [F, 3]
@@ -71,9 +71,20 @@ class Scene(nn.Module):
         )
         self.object_splats = object_splats
         self.object_poses = object_poses
-        self.object_surface = object_surface
+        # Kept with what is trained: a prior may move it.
+        verts, faces = (
+            (None, None) if object_surface is None else (object_surface.verts, object_surface.faces)
+        )
+        self.register_buffer("surface_verts", verts)
+        self.register_buffer("surface_faces", faces, persistent=False)
         self.object_distance = object_distance
         self.lighting = lighting
+
+    @property
+    def object_surface(self) -> ObjectSurface | None:
+        if self.surface_verts is None:
+            return None
+        return ObjectSurface(self.surface_verts, self.surface_faces)
 
     @property
     def sides(self) -> tuple[Side, ...]:

@@ -84,18 +84,56 @@ class SplitStage:
 
 
 # What is believed of the object's parts that no frame shows.
-PriorKind = Literal["off", "symmetry"]
+PriorKind = Literal["off", "symmetry", "trained", "sd"]
 
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """What completes the object where it was never seen."""
+    """What completes the object where it was never seen: each kind does what those before it do, and more.
+
+    `trained` is a file of bigs prior train, `sd` Stable Diffusion with what belongs to it.
+    """
 
     kind: PriorKind = "off"
+    weights: str = ""  # the file, or Stable Diffusion's folder or hub name
+    object_name: str = "object"  # for Stable Diffusion's prompts
+    controlnet: str = ""  # folder or hub name of a soft-edge ControlNet
+    token: str = ""  # file of bigs prior fit
+    edge_weights: str = ""  # PiDiNet's file
     completion: CompletionConfig = field(default_factory=CompletionConfig)
 
 
-Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage
+@dataclass(frozen=True)
+class GuidanceStage:
+    """A diffusion prior completes the object where it was never seen (paper Eq. 7; see `guided`).
+
+    Without a prior's weights, or where the clip saw all of the object, there is no such stage.
+    """
+
+    name: str = "object-prior"
+    step: Step = "single-subject"
+    steps: int = 300
+    # Virtual views in a step, and their size in pixels.
+    views: int = 4
+    image_size: int = 64
+    # Learning rates: metres along the normal, and logarithms or logits.
+    lr_shift: float = 5e-4
+    lr_size: float = 0.01
+    lr_opacity: float = 0.02
+    lr_color: float = 0.05
+    # Weight of the evenness of neighbours' shifts.
+    smooth: float = 0.01
+    # Range of timesteps at the start and at the end, as shares of the prior's schedule.
+    t_first: tuple[float, float] = (0.5, 0.98)
+    t_last: tuple[float, float] = (0.02, 0.3)
+    # The stage is skipped when this share of the object was seen, and so are views of which this share was.
+    enough: float = 0.9
+    well_seen: float = 0.85
+    # What was seen may come to show so much worse; beyond that all is undone.
+    damage: float = 0.02
+
+
+Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | GuidanceStage
 
 
 @dataclass(frozen=True)

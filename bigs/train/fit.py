@@ -17,6 +17,7 @@ from torch import Tensor
 import bigs
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
@@ -25,8 +26,17 @@ from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
 from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
-from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage, Stage
+from bigs.train.config import (
+    GraspStage,
+    GuidanceStage,
+    OptimizeStage,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+    Stage,
+)
 from bigs.train.grasps import find_grasps
+from bigs.train.guided_scene import guide_scene
 from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.optim import GROUPS
@@ -63,6 +73,7 @@ def fit(
     config: RunConfig,
     *,
     perceptual: VggWeights | None = None,
+    denoiser: Denoiser | None = None,
     checkpoints: Path | None = None,
     resume: bool = False,
     listen: Listener = lambda event: None,
@@ -74,6 +85,7 @@ def fit(
         hand_models: both sides' models.
         config: what to do.
         perceptual: the network for the term of that name; without it the term is off.
+        denoiser: the diffusion prior of the plan's `GuidanceStage`; without it there is no such stage.
         checkpoints: folder for checkpoints; None keeps none.
         resume: continue from the checkpoint there, if there is one.
         listen: told of stages, steps and notes as they happen.
@@ -84,6 +96,7 @@ def fit(
     """
     report = FitReport()
     config, network_note = _without_missing_network(config, perceptual)
+    config, prior_note = _without_missing_prior(config, clip, denoiser)
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
@@ -97,7 +110,7 @@ def fit(
         config.lighting,
         None if config.prior.kind == "off" else config.prior.completion,
     )
-    report.skipped += [network_note, *skipped] if network_note else skipped
+    report.skipped += [note for note in (network_note, prior_note) if note] + skipped
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
@@ -120,6 +133,8 @@ def fit(
         if index < first:
             continue
         why = _not_needed(stage, scene)
+        if isinstance(stage, GuidanceStage) and "object completed" in report.facts:
+            why = "symmetry has completed the object"
         if why:
             report.skipped.append(f"{stage.name}: {why}")
             continue
@@ -139,6 +154,17 @@ def fit(
             scene.object_splats = split_object(whole, stage.parts, stage.least_opacity)
             text = f"{len(whole.means)} Gaussians of the object become {len(scene.object_splats.shift)}"
             listen({"event": "note", "stage": stage.name, "text": text})
+        elif isinstance(stage, GuidanceStage):
+            evidence = sources.evidence(_OBSERVED_AT)
+
+            def tell(step: int, loss: float, stage: GuidanceStage = stage, index: int = index) -> None:
+                progress = {"step": step, "steps": stage.steps, "loss": loss, "terms": {}, "seconds": 0.0}
+                listen({"event": "step", "stage": stage.name, "index": index, **progress})
+
+            done = guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, tell)
+            if done.skipped:
+                report.skipped.append(f"{stage.name}: {done.skipped}")
+            report.facts |= done.facts
         else:
             continues = position.resume if position and index == first else None
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
@@ -207,13 +233,33 @@ def _without_missing_network(config: RunConfig, network: VggWeights | None) -> t
     )
 
 
+# The size at which the guard over what was seen looks.
+_OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
+
+
+def _without_missing_prior(
+    config: RunConfig, clip: Clip, denoiser: Denoiser | None
+) -> tuple[RunConfig, str | None]:
+    """The configuration without the stages that need a denoiser, if there is none; what to tell the user."""
+    asking = [stage for stage in config.stages if isinstance(stage, GuidanceStage)]
+    if denoiser is not None:
+        return config, None if asking else "prior: weights were given, but no stage of this plan uses them"
+    rest = tuple(stage for stage in config.stages if not isinstance(stage, GuidanceStage))
+    note = (
+        "prior: no diffusion; --prior-weights turns it on, with a FILE of bigs prior train "
+        "or a FOLDER of Stable Diffusion"
+    )
+    wanted = config.prior.kind != "off" and clip.object is not None
+    return replace(config, stages=rest), note if wanted else None
+
+
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
     if isinstance(stage, ScaleSearchStage | GraspStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
-    if isinstance(stage, SplitStage):
+    if isinstance(stage, SplitStage | GuidanceStage):
         return "the clip has no object" if scene.object_splats is None else None
     if not stage.weights:
         return "no loss term is left"
@@ -341,6 +387,12 @@ def check_plan(config: RunConfig) -> None:
             least[f"{where}.slack"] = (stage.slack, 0.0)
             least[f"{where}.bridge"] = (stage.bridge, 0)
             least[f"{where}.longest_move"] = (stage.longest_move, 0)
+            continue
+        if isinstance(stage, GuidanceStage):
+            least[f"{where}.steps"] = (stage.steps, 0)
+            least[f"{where}.views"] = (stage.views, 1)
+            least[f"{where}.image_size"] = (stage.image_size, 16)
+            least[f"{where}.damage"] = (stage.damage, 0.0)
             continue
         if isinstance(stage, SplitStage):
             least[f"{where}.parts"] = (stage.parts, 1)

@@ -7,7 +7,15 @@ from dataclasses import replace
 from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.train.config import GraspStage, OptimizeStage, PriorConfig, RunConfig, ScaleSearchStage, SplitStage
+from bigs.train.config import (
+    GraspStage,
+    GuidanceStage,
+    OptimizeStage,
+    PriorConfig,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+)
 from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
@@ -174,6 +182,7 @@ FAST = RunConfig(
         replace(_JOINT, steps=180),
         SplitStage(),
         _OBJECT_DETAIL,
+        GuidanceStage(),
     ),
 )
 
@@ -190,6 +199,7 @@ DEMO = replace(
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
         replace(_JOINT, steps=110),
+        GuidanceStage(steps=150),
     ),
 )
 
@@ -219,12 +229,14 @@ FULL = replace(
         ),
         SplitStage(),
         replace(_OBJECT_DETAIL, steps=200, image_size=640),
+        GuidanceStage(steps=600),
     ),
 )
 
 # Seconds, for tests: every kind of stage, hardly any steps.
 SMOKE = replace(
     FAST,
+    prior=PriorConfig(),
     hand=replace(FAST.hand, subdivisions=0, triplane=TriplaneConfig(features=4, resolution=32)),
     object=replace(FAST.object, n_gaussians=600, triplane=TriplaneConfig(features=4, resolution=32)),
     initial=InitialConfig(surface_resolution=40),
@@ -239,12 +251,13 @@ SMOKE = replace(
         replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
         SplitStage(),
         replace(_OBJECT_DETAIL, steps=6, image_size=120, frames_per_step=3),
+        GuidanceStage(steps=4, views=2),
     ),
 )
 
 # The paper as written: Eq. 4-6 alone for each subject, then Eq. 9 with Eq. 8, one frame a step at full size,
 # the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. L_vgg counts
-# when its network is given; L_SDS, which needs other networks, is not in it.
+# when its network is given, and so does L_SDS (Eq. 7) with its prior's weights, for the object alone.
 _PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "color": 0.1, "scale": 100.0, "mask": 10.0}
 PAPER = RunConfig(
     initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
@@ -287,6 +300,7 @@ PAPER = RunConfig(
             frames_per_step=1,
             final_lr=1.0,
         ),
+        GuidanceStage(steps=1000),
         OptimizeStage(
             name="translations",
             step="interacting-subjects",

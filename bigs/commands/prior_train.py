@@ -1,0 +1,198 @@
+"""`bigs prior train`: a small prior from a folder of meshes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.spatial
+import torch
+import trimesh
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from bigs.atomic import atomic_write
+from bigs.checks import InputError
+from bigs.commands.prior import state_path
+from bigs.geometry.coverage import sphere_directions
+from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
+from bigs.geometry.rotations import matrix_to_quat
+from bigs.guidance.cameras import make_orbit, virtual_cameras
+from bigs.guidance.diffusers_folder import Device, choose
+from bigs.guidance.pixel import PIXELS, PixelConfig
+from bigs.guidance.pixel_file import save_pixel_net
+from bigs.guidance.pixel_training import Pictures, PixelTraining, PixelTrainingConfig
+from bigs.models.object_splats import CanonicalObject
+from bigs.raster.settings import RasterSettings
+from bigs.train.guided import render_object
+
+__all__ = ["PixelConfig", "PixelTrainingConfig", "TrainedPrior", "train_prior"]
+
+FORMAT = "bigs-pixel-state-1"
+_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
+_GAUSSIANS = 3000
+# Standard deviation of a Gaussian on the mesh, in spacings of its neighbours, and along the normal.
+_SPREAD, _FLATNESS = 0.6, 0.35
+
+
+class TrainedPrior(NamedTuple):
+    """What `train_prior` came to."""
+
+    path: Path
+    steps: int  # taken now
+    loss: float  # mean over the last tenth of these
+    meshes: int
+    pictures: int
+    parameters: int
+
+
+def train_prior(
+    meshes: Path,
+    out: Path,
+    config: PixelTrainingConfig,
+    *,
+    views: int = 32,
+    up: str = "z",
+    device: Device = "auto",
+    resume: bool = False,
+    keep_every: int = 500,
+    listen: Callable[[dict[str, Any]], None] = lambda event: None,
+) -> TrainedPrior:
+    """Train a denoiser on renderings of meshes, and write it.
+
+    While it works, what is needed to go on lies beside `out`; killed at any instant, it can be resumed and
+    ends in the same bytes, on the same machine with as many threads.
+
+    Args:
+        meshes: folder of meshes; any size and unit, `up` along the named axis.
+        out: the .safetensors file to write.
+        config: the training.
+        views: pictures of each mesh.
+        up: "x", "y" or "z".
+        device: where the network runs; pictures are made on the CPU.
+        resume: go on from what lies beside `out`, if anything does.
+        keep_every: steps between the states that are kept.
+        listen: told what happens: "start", "step".
+
+    Raises:
+        InputError: something given is missing or does not fit; one sentence says what.
+    """
+    kept = state_path(out, resume)
+    files = _mesh_files(meshes)
+    training = PixelTraining(config, choose(device, "float32")[0])
+    origin = _digest(files, config, views, up)
+    if kept.exists():
+        _restore(training, kept, origin)
+    parts = [mesh_pictures(file, views, up, config.seed + index) for index, file in enumerate(files)]
+    pictures = Pictures(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    parameters = sum(p.numel() for p in training.net.parameters())
+    weights_gib = sum(p.nbytes for p in training.net.parameters()) / 2.0**30
+    listen({"event": "start", "weights_gib": weights_gib, "step": training.step})
+    losses = []
+    while training.step < config.steps:
+        losses.append(training.take_step(pictures))
+        listen({"event": "step", "step": training.step, "steps": config.steps, "loss": losses[-1]})
+        if training.step % keep_every == 0:
+            metadata = {"format": FORMAT, "origin": origin, "step": str(training.step)}
+            with atomic_write(kept) as file:
+                file.write(save(training.state(), metadata))
+    save_pixel_net(out, training.mean.cpu())
+    kept.unlink(missing_ok=True)
+    last = losses[-max(1, len(losses) // 10) :]
+    loss = sum(last) / len(last) if last else float("nan")
+    return TrainedPrior(out, len(losses), loss, len(files), len(pictures.images), parameters)
+
+
+def _mesh_files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of meshes, found no such folder")
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise InputError(f"{folder}: expected meshes ({', '.join(_SUFFIXES)}), found none")
+    return files
+
+
+def _digest(files: list[Path], config: PixelTrainingConfig, views: int, up: str) -> str:
+    settings = json.dumps([asdict(config), views, up, [file.name for file in files]])
+    digest = hashlib.sha256(settings.encode())
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _restore(training: PixelTraining, path: Path, origin: str) -> None:
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(
+            f"{path}: expected a readable state, found: {error} (remove it to start anew)"
+        ) from error
+    if metadata.get("format") != FORMAT or metadata.get("origin") != origin:
+        raise InputError(
+            f"{path}: expected a state of these meshes and options, found one of others (remove it to start "
+            "anew)"
+        )
+    training.restore(tensors, int(metadata["step"]))
+
+
+def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
+    """A mesh covered with flat Gaussians, z up, within a ball of 10 cm.
+
+    Raises:
+        InputError: no triangle mesh.
+    """
+    try:
+        mesh = trimesh.load(file, force="mesh", process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
+        raise InputError(f"{file}: expected a mesh, found {error or type(error).__name__}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"{file}: expected a triangle mesh, found one without faces")
+    verts = np.asarray(mesh.vertices, dtype=np.float64)
+    verts = verts - 0.5 * (verts.min(0) + verts.max(0))
+    verts = 0.1 * verts / np.linalg.norm(verts, axis=-1).max()
+    verts = np.roll(verts, 2 - "xyz".index(up), axis=-1)
+    points, normals = sample_surface(verts, np.asarray(mesh.faces), _GAUSSIANS)
+    visual: Any = mesh.visual
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        visual = visual.to_color()
+    colors = np.asarray(visual.vertex_colors)[:, :3] / 255.0
+    nearest = scipy.spatial.cKDTree(verts).query(points)[1]
+    spacing = point_spacing(points)
+    as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
+    scales = _SPREAD * spacing[:, None] * np.array([1.0, 1.0, _FLATNESS])
+    means = as_tensor(points)
+    return CanonicalObject(
+        means,
+        torch.zeros_like(means),
+        matrix_to_quat(as_tensor(frames_from_normals(normals))),
+        as_tensor(scales),
+        torch.full((len(means),), 0.95),
+        as_tensor(colors[nearest]),
+        as_tensor(normals),
+    )
+
+
+def mesh_pictures(file: Path, views: int, up: str, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures [views, 3, 64, 64] (uint8) of a mesh with their azimuths and elevations.
+
+    The front is drawn for each mesh: in a reconstruction it is the side that the clip saw, whichever it is.
+    """
+    whole = mesh_gaussians(file, up)
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    front = torch.tensor([np.cos(angle), np.sin(angle), 0.0], dtype=torch.float32)
+    orbit = make_orbit(whole.means, torch.tensor([0.0, 0.0, 1.0]), front)
+    turned = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    directions = torch.as_tensor(sphere_directions(views) @ turned.T, dtype=torch.float32)
+    cameras = virtual_cameras(orbit, directions, PIXELS)
+    with torch.no_grad():
+        images = render_object(whole, cameras, PIXELS, RasterSettings())
+    return (255.0 * images.clamp(0.0, 1.0)).round().to(torch.uint8), cameras.azimuths, cameras.elevations

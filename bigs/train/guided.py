@@ -1,0 +1,188 @@
+"""The object's unseen Gaussians follow a diffusion prior (paper Eq. 7); what was seen stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.spatial
+import torch
+from torch import Tensor
+
+from bigs.geometry.coverage import coverage_by_direction, sphere_directions
+from bigs.guidance.cameras import (
+    Orbit,
+    VirtualCameras,
+    draw_directions,
+    view_weights,
+    virtual_cameras,
+)
+from bigs.guidance.denoiser import Conditions, Denoiser
+from bigs.guidance.schedule import SdsConfig
+from bigs.guidance.sds import sds_loss
+from bigs.models.object_detail import ObjectDetail
+from bigs.models.object_splats import CanonicalObject
+from bigs.raster import rasterization
+from bigs.raster.settings import RasterSettings
+from bigs.train.config import GuidanceStage
+
+# Directions from which the object is looked at, before they are moved a little.
+_DIRECTIONS = 256
+_NEIGHBOURS = 8
+
+
+class Coverage(NamedTuple):
+    """How much of the object a clip has seen."""
+
+    seen: Tensor  # [N] bool, per Gaussian
+    directions: Tensor  # [D, 3] unit, object frame
+    by_direction: Tensor  # [D] in [0, 1]
+
+    @property
+    def share(self) -> float:
+        return float(self.seen.float().mean())
+
+
+def coverage_of(normals: Tensor, seen: Tensor) -> Coverage:
+    """The coverage of Gaussians with unit normals [N, 3], of which those marked in `seen` [N] were seen."""
+    directions = sphere_directions(_DIRECTIONS)
+    covered = coverage_by_direction(normals.numpy().astype(np.float64), seen.numpy(), directions)
+    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
+    return Coverage(seen, as_tensor(directions), as_tensor(covered))
+
+
+@dataclass(frozen=True)
+class Guided:
+    """What the prior did."""
+
+    moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
+    before: float  # error of the seen part's picture
+    after: float
+    rolled_back: bool
+
+
+def render_object(
+    canonical: CanonicalObject, cameras: VirtualCameras, size: int, settings: RasterSettings
+) -> Tensor:
+    """Pictures [B, 3, size, size] of the object alone, unlit, on white."""
+    out = rasterization(
+        canonical.means,
+        canonical.quats,
+        canonical.scales,
+        canonical.opacities,
+        canonical.colors,
+        cameras.viewmats,
+        cameras.K.expand(len(cameras.viewmats), 3, 3),
+        size,
+        size,
+        settings=settings,
+        backgrounds=torch.ones(len(cameras.viewmats), 3),
+    )
+    return out.colors.permute(0, 3, 1, 2)
+
+
+def guide_object(
+    detail: ObjectDetail,
+    coverage: Coverage,
+    orbit: Orbit,
+    denoiser: Denoiser,
+    stage: GuidanceStage,
+    settings: RasterSettings,
+    image_error: Callable[[], float],
+    seed: int = 0,
+    after_step: Callable[[int, float], None] = lambda step, loss: None,
+) -> Guided:
+    """Optimise what was not seen of the object in place by score distillation from virtual cameras.
+
+    No gradient reaches a Gaussian that was seen. Unseen ones can still come to stand before seen ones; so the
+    seen part's error is measured before and after, and all is undone if it grew more than the stage allows.
+
+    Args:
+        detail: the object's own Gaussians.
+        coverage: which of them were seen; some were not.
+        orbit: where the virtual cameras stand.
+        denoiser: the prior.
+        stage: steps, rates, weights.
+        settings: of the renderer.
+        image_error: the error of the pictures of what was seen, as the object is now.
+        seed: of views, timesteps and noise.
+        after_step: told the steps done and the loss.
+
+    Raises:
+        FloatingPointError: the prior's estimate is not finite.
+    """
+    sds = SdsConfig(stage.t_first, stage.t_last)
+    generator = torch.Generator().manual_seed(seed)
+    weights = view_weights(coverage.by_direction, stage.well_seen)
+    kept = {name: value.detach().clone() for name, value in detail.state_dict().items()}
+    with torch.no_grad():
+        start = detail().means.clone()
+    unseen = ~coverage.seen
+    neighbours, spacing = _neighbours(start)
+    before = image_error()
+    rates = {
+        "shift": stage.lr_shift,
+        "size": stage.lr_size,
+        "opacity": stage.lr_opacity,
+        "color": stage.lr_color,
+    }
+    parameters = {name: getattr(detail, name) for name in rates}
+    for parameter in parameters.values():
+        parameter.requires_grad_(True)
+    optimizer = torch.optim.Adam(
+        [{"params": [parameters[name]], "lr": lr} for name, lr in rates.items()], betas=(0.9, 0.99)
+    )
+    for step in range(stage.steps):
+        directions = draw_directions(coverage.directions, weights, stage.views, generator)
+        cameras = virtual_cameras(orbit, directions, stage.image_size)
+        canonical = _freed(detail(), unseen)
+        images = render_object(canonical, cameras, stage.image_size, settings)
+        prior = sds_loss(
+            denoiser,
+            images,
+            Conditions(cameras.azimuths, cameras.elevations),
+            sds,
+            progress=step / stage.steps,
+            generator=generator,
+        )
+        # Neighbours move together, so that the surface stays one.
+        rough = (detail.shift - detail.shift[neighbours].mean(1)) / spacing
+        loss = prior + stage.smooth * rough[unseen].square().sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for parameter in parameters.values():
+            parameter.grad[coverage.seen] = 0.0
+        optimizer.step()
+        after_step(step + 1, float(loss.detach()))
+    for parameter in parameters.values():
+        parameter.requires_grad_(False)
+    after = image_error()
+    if after > (1.0 + stage.damage) * before:
+        detail.load_state_dict(kept)
+        return Guided(torch.zeros_like(start), before, after, True)
+    with torch.no_grad():
+        return Guided(detail().means - start, before, after, False)
+
+
+def _freed(canonical: CanonicalObject, free: Tensor) -> CanonicalObject:
+    """The same Gaussians; gradients reach only those marked in `free` [N]."""
+    held = (
+        torch.where(free.reshape(-1, *[1] * (value.ndim - 1)), value, value.detach()) for value in canonical
+    )
+    return CanonicalObject(*held)
+
+
+def _neighbours(means: Tensor) -> tuple[Tensor, float]:
+    """The nearest others [N, K] of points [N, 3], and the median distance to the first, metres."""
+    distance, index = scipy.spatial.cKDTree(means.numpy()).query(means.numpy(), k=_NEIGHBOURS + 1)
+    return torch.as_tensor(index[:, 1:]), float(np.median(distance[:, 1]))
+
+
+def follow(verts: Tensor, means: Tensor, moved: Tensor) -> Tensor:
+    """A mesh's vertices [V, 3], moved as the Gaussians around them, at `means` [N, 3], by `moved` [N, 3]."""
+    distance, index = scipy.spatial.cKDTree(means.numpy()).query(verts.numpy(), k=_NEIGHBOURS)
+    weights = torch.as_tensor(1.0 / (distance + 1e-4), dtype=verts.dtype)
+    weights = weights / weights.sum(1, keepdim=True)
+    return verts + (weights[..., None] * moved[torch.as_tensor(index)]).sum(1)

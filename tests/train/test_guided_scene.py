@@ -1,0 +1,141 @@
+"""The prior as a stage of a run: with and without its weights, on an object that was seen, resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bigs.checks import InputError
+from bigs.cli import main
+from bigs.commands.prior_weights import load_prior, with_prior
+from bigs.data.base import Clip
+from bigs.data.excerpt import excerpt
+from bigs.guidance.pixel import PixelConfig, PixelDenoiser, PixelNet
+from bigs.guidance.pixel_file import save_pixel_net
+from bigs.hand import HandModel
+from bigs.models.object_detail import ObjectDetail
+from bigs.models.scene import Scene
+from bigs.train.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
+from bigs.train.fit import FitReport, fit
+from bigs.train.presets import PRESETS, SMOKE
+from bigs.types import Side
+
+STAGE = GuidanceStage(steps=3, views=2, image_size=32)
+PLAN = replace(SMOKE, stages=(SplitStage(parts=1), STAGE))
+
+
+@pytest.fixture(scope="module")
+def prior() -> PixelDenoiser:
+    torch.manual_seed(0)
+    return PixelDenoiser(PixelNet(PixelConfig(width=16, embedding=32)))
+
+
+@pytest.fixture(scope="module")
+def one_side(tiny: Clip) -> Clip:
+    """Three frames that stand nearly still."""
+    return excerpt(tiny, torch.arange(3).numpy())
+
+
+def run(
+    clip: Clip, hands: dict[Side, HandModel], plan: RunConfig, prior: PixelDenoiser | None, **more: object
+) -> tuple[Scene, FitReport]:
+    return fit(clip, hands, plan, denoiser=prior, **more)  # type: ignore[arg-type]
+
+
+def test_the_unseen_part_moves_and_its_surface_follows(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    free = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, damage=1e9)))
+    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+    after, report = run(one_side, both_hands, free, prior)
+    assert report.skipped == []
+    assert "moved what was not seen by" in report.facts["prior"]
+    change = (after.object_splats().means - before.object_splats().means).norm(dim=-1)
+    assert 0.1 < float((change == 0).float().mean()) < 0.95
+    assert float((after.object_surface.verts - before.object_surface.verts).abs().max()) > 1e-5
+    assert not any(parameter.requires_grad for parameter in after.parameters())
+
+
+def test_an_object_without_a_split_is_taken_out_of_its_field(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    scene, _ = run(one_side, both_hands, replace(PLAN, stages=(STAGE,)), prior)
+    assert isinstance(scene.object_splats, ObjectDetail)
+
+
+def test_without_weights_one_line_says_so(one_side: Clip, both_hands: dict[Side, HandModel]) -> None:
+    _, report = run(one_side, both_hands, replace(PLAN, prior=PriorConfig("symmetry")), None)
+    about = [line for line in report.skipped if "prior" in line]
+    assert len(about) == 1 and "--prior-weights" in about[0]
+    assert STAGE.name not in report.seconds
+    _, silent = run(one_side, both_hands, PLAN, None)
+    assert silent.skipped == []
+
+
+def test_an_object_that_was_seen_is_skipped(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    for stage in (replace(STAGE, enough=0.01), replace(STAGE, well_seen=0.0)):
+        _, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), stage)), prior)
+        assert "of the object was seen" in report.skipped[0]
+
+
+def test_a_clip_without_an_object_is_skipped(
+    tiny: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    _, report = run(replace(tiny, object=None), both_hands, replace(PLAN, stages=(STAGE,)), prior)
+    assert report.skipped == [f"{STAGE.name}: the clip has no object"]
+
+
+def test_a_finished_stage_is_not_lost_on_resume(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, tmp_path: Path
+) -> None:
+    """Surface and Gaussians come back from the checkpoint; the stage does not run again."""
+    plan = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, damage=1e9)))
+    first, _ = run(one_side, both_hands, plan, prior, checkpoints=tmp_path)
+    events: list[dict[str, object]] = []
+    again, _ = run(one_side, both_hands, plan, prior, checkpoints=tmp_path, resume=True, listen=events.append)
+    assert not any(event["event"] == "step" for event in events)
+    torch.testing.assert_close(again.object_surface.verts, first.object_surface.verts, rtol=0, atol=0)
+
+
+def test_what_the_options_mean(tmp_path: Path) -> None:
+    file = str(tmp_path / "prior.safetensors")
+    nothing = dict.fromkeys(("weights", "controlnet", "token", "edge_weights"), "")
+    fast = PRESETS["fast"]
+    assert with_prior(fast, "auto", "object", nothing) == fast
+    assert with_prior(fast, "off", "object", nothing).prior.kind == "off"
+    assert with_prior(fast, "auto", "object", {**nothing, "weights": file}).prior.kind == "trained"
+    sd = with_prior(fast, "auto", "mug", {**nothing, "weights": "folder", "token": "t.safetensors"}).prior
+    assert (sd.kind, sd.weights, sd.object_name, sd.token) == ("sd", "folder", "mug", "t.safetensors")
+    with pytest.raises(InputError, match="--prior sd: expected --prior-weights"):
+        with_prior(fast, "sd", "object", nothing)
+    with pytest.raises(InputError, match="--prior-weights: expected a prior that uses it"):
+        with_prior(fast, "symmetry", "object", {**nothing, "weights": file})
+    with pytest.raises(InputError, match="--prior-token: expected a prior that uses it"):
+        with_prior(fast, "trained", "object", {**nothing, "weights": file, "token": "t"})
+
+
+def test_weights_are_loaded(tmp_path: Path) -> None:
+    save_pixel_net(tmp_path / "prior.safetensors", PixelNet(PixelConfig(width=16, embedding=32)))
+    weights = str(tmp_path / "prior.safetensors")
+    assert isinstance(load_prior(PriorConfig("trained", weights)), PixelDenoiser)
+    assert load_prior(PriorConfig("symmetry")) is None
+    (tmp_path / "sd").mkdir()
+    with pytest.raises(InputError, match="sd"):
+        load_prior(PriorConfig("sd", str(tmp_path / "sd")))
+
+
+def test_a_run_refuses_missing_weights_before_it_begins(
+    tiny_clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tmp_path / "none.safetensors"
+    command = ["reconstruct", str(tiny_clip), "--out", str(tmp_path / "run"), "--preset", "smoke"]
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--prior-weights", str(weights)])
+    assert stop.value.code == 2
+    assert f"{weights}: expected a file of bigs prior train" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
