@@ -19,9 +19,8 @@ from bigs.train.guided import Coverage, coverage_of, follow, guide_object
 from bigs.train.terms import Evidence
 from bigs.train.terms import Step as LossStep
 
-# A Gaussian counts as seen when it shows in so many frames; poses are wrong by about so much, metres, and
-# depths are known to about so many pixels.
-_LEAST_FRAMES, _TOLERANCE, _PIXELS = 3, 0.006, 3.0
+# A Gaussian counts as seen when it shows in so many frames; poses are wrong by about so much, metres.
+_LEAST_FRAMES, _TOLERANCE = 3, 0.006
 # Frames on which the guard looks.
 _GUARD_FRAMES = 12
 
@@ -46,8 +45,7 @@ def scene_coverage(scene: Scene, evidence: Evidence) -> tuple[Coverage, Orbit]:
     shown = evidence.targets.shares["object"] > 0.5
     views = ObjectViews(shown.numpy(), evidence.targets.K.numpy(), rotations.numpy(), centers.numpy())
     points, normals = canonical.means.numpy().astype(np.float64), canonical.normals.numpy()
-    pixel = float(centers[:, 2].median() / evidence.targets.K[0, 0])
-    frames = times_seen(views, points, normals, points, max(_TOLERANCE, _PIXELS * pixel))
+    frames = times_seen(views, points, normals, points, _TOLERANCE)
     seen = torch.as_tensor(frames >= min(_LEAST_FRAMES, scene.n_frames))
     up = -rotations[:, 1].mean(0)
     towards = -(rotations.transpose(-1, -2) @ centers[..., None])[..., 0]

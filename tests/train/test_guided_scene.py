@@ -35,8 +35,8 @@ def prior() -> PixelDenoiser:
 
 @pytest.fixture(scope="module")
 def one_side(tiny: Clip) -> Clip:
-    """Three frames that stand nearly still."""
-    return excerpt(tiny, torch.arange(3).numpy())
+    """Five frames, in which one side shows."""
+    return excerpt(tiny, torch.arange(5).numpy())
 
 
 def run(

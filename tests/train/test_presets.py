@@ -76,5 +76,5 @@ def test_a_plan_needs_stages_of_different_names() -> None:
     smoke = PRESETS["smoke"]
     with pytest.raises(ValueError, match="at least one stage, found none"):
         check_plan(RunConfig())
-    with pytest.raises(ValueError, match="unique names, found 'object-detail' twice"):
+    with pytest.raises(ValueError, match="unique names, found 'object-prior' twice"):
         check_plan(RunConfig(stages=(smoke.stages[-1], smoke.stages[-1])))
