@@ -197,7 +197,7 @@ def test_a_checkpoint_of_another_run_is_refused(
     if what == "seed":
         config = replace(config, seed=1)
     elif what == "a rate":
-        config.stages[-1].lrs["object.ray"] *= 2
+        config.stages[-2].lrs["object.ray"] *= 2
     elif what == "name":
         clip = replace(clip, name="other")
     elif what == "frame names":
