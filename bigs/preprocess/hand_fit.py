@@ -34,6 +34,10 @@ class HandFitConfig:
     # Typical second differences over time of joints and of finger angles.
     joint_acceleration: float = 0.003
     angle_acceleration: float = 0.08
+    # Shape is held to the mean as if every clip had been seen so many times over: errors of the poses are
+    # alike in
+    # all frames, so many frames say little more of the shape than few.
+    shape_weight: float = 10.0
     # How far joints move from frame to frame, which chooses among candidates.
     reach: float = 0.008
     # A frame with fewer keypoints, or fewer that are explained, is marked as having no estimate.
@@ -183,14 +187,18 @@ def _refine(
     target, weight = rays.flatten(0, 1), trust.flatten(0, 1)
     spread = sigma.repeat_interleave(frames)
     by_hand = lambda x: x.reshape(hands, frames, *x.shape[1:])  # noqa: E731
+    usual_size = skeleton.size(torch.zeros(10))
 
     def total() -> Tensor:
         poses = variables.poses()
         joints = skeleton.joints(betas, *poses)
         loss = _misfit(joints, target, weight, spread, config.outlier).sum()
-        loss = loss + 0.5 * skeleton.unlikeliness(poses.angles).sum() + 0.5 * betas.square().sum()
+        loss = loss + 0.5 * skeleton.unlikeliness(poses.angles).sum()
+        loss = loss + 0.5 * config.shape_weight * betas.square().sum()
         if frames > 2:
-            joint = second_differences(by_hand(joints)) / (config.joint_acceleration * pace**2)
+            # In units of the hand's own size, or else a small hand near the camera would seem the smoother.
+            step = config.joint_acceleration * pace**2 * skeleton.size(betas) / usual_size
+            joint = second_differences(by_hand(joints)) / step
             angle = second_differences(by_hand(poses.angles)) / (config.angle_acceleration * pace**2)
             loss = loss + _robust(joint.square().sum(-1), 4.0).sum() / 3.0
             loss = loss + _robust(angle.square().sum(-1), 4.0).sum()

@@ -74,6 +74,11 @@ class HandSkeleton:
         table = torch.tensor([[(a.mean, a.spread, a.lowest, a.highest) for a in row] for row in rows])
         self.mean, self.spread, self.lowest, self.highest = table.unbind(-1)  # [15, 3] each
 
+    def size(self, betas: Tensor) -> Tensor:
+        """From the wrist to the middle finger's knuckle, metres, of the shape `betas` [10]."""
+        joints = self.rest_joints + torch.einsum("s,sjc->jc", betas, self.shape_moves)[:16]
+        return (joints[4] - joints[0]).norm()
+
     def fingers(self, angles: Tensor) -> Tensor:
         """Rotation vectors [..., 15, 3] of anatomical angles [..., 15, 3] (bend, spread, twist)."""
         return torch.einsum("...ja,jac->...jc", angles, self.axes)
