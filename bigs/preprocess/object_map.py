@@ -173,6 +173,8 @@ class ObjectMap:
     def adjust(self, frames: np.ndarray, free: np.ndarray, config: BundleConfig) -> None:
         """Bundle adjustment of consecutive `frames` [F], of which `free` [F] (bool) may move."""
         bundle, tracks = self.bundle(frames)
+        if len(tracks) == 0:
+            return
         bundle = adjust(bundle, self.K, config, free=free)
         self.rotations[frames], self.transl[frames] = bundle.rotations, bundle.transl
         self.points[tracks] = bundle.points

@@ -164,11 +164,13 @@ def _best_attempt(
     for number, model in enumerate(mapping.models[: config.seeds]):
         map_ = ObjectMap(features, tracks, K, config.map)
         seed = find_seed(map_, model)
-        if seed is None:
+        if seed is None or not map_.use().any():
             continue
         tried += 1
         grow(map_, config.grow)
         polish(map_, config.grow.rounds)
+        if not map_.use().any():
+            continue
         attempt = _Attempt(map_, seed, number, check_map(map_, features, tracks, config.checks))
         if best is None or _rank(attempt) > _rank(best):
             best = attempt

@@ -83,6 +83,13 @@ def test_the_search_finds_points_that_were_never_matched(egg: TurningObject) -> 
     assert np.percentile(errors, 90) < 1.0
 
 
+def test_frames_without_a_known_point_are_left_where_they_are(egg: TurningObject) -> None:
+    found = at_truth(egg)
+    found.known[:] = False
+    found.adjust(np.arange(5), np.ones(5, dtype=bool), found.config.bundle)
+    assert np.array_equal(found.rotations[:5], egg.rotations[:5])
+
+
 def test_nothing_is_flagged_where_nothing_is_wrong(egg: TurningObject) -> None:
     checks = check_map(at_truth(egg), egg.features, egg.tracks(), CheckConfig())
     assert not any(checks.flags)
