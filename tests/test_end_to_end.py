@@ -251,6 +251,7 @@ def test_the_mesh(finished_run: Run, scene: dict[str, np.ndarray]) -> None:
 
 
 def test_the_result_projects_onto_the_masks(scene: dict[str, np.ndarray], tiny: Clip) -> None:
+    shares = []
     for t in range(0, len(tiny), 3):
         labels = tiny.mask(t)
         for side in ("right", "left"):
@@ -258,7 +259,9 @@ def test_the_result_projects_onto_the_masks(scene: dict[str, np.ndarray], tiny: 
             column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
             inside = (column >= 0) & (column < tiny.width) & (row >= 0) & (row < tiny.height)
             assert inside.mean() > 0.95
-            assert (labels[row[inside], column[inside]] != 0).mean() > 0.75
+            shares.append((labels[row[inside], column[inside]] != 0).mean())
+    # A few steps: a single frame may still be off.
+    assert np.mean(shares) > 0.85 and min(shares) > 0.6
 
 
 def test_pictures(finished_run: Run, tiny: Clip) -> None:

@@ -31,7 +31,7 @@ STEPS = {
     "appearance": 3,
     "contact": 3,
     "joint": 4,
-    "object-detail": 3,
+    "detail": 3,
 }
 QUICK = [
     f"--set=stages.{stage}.{change}"

@@ -31,6 +31,8 @@ class HandSplatsConfig:
     subdivisions: int = 1
     # Share one canonical hand (and one shape) between both sides; the paper's "share".
     shared: bool = True
+    # Standard deviation of an estimate of betas that no second hand confirms; 0 trusts it entirely.
+    shape_error: float = 0.6
     # Let the geometry field move, turn and scale the Gaussians. The released code freezes them.
     learn_geometry: bool = True
     # Standard deviations at the start: along the surface in units of the local spacing, across it in units
@@ -105,7 +107,7 @@ class HandSplats(nn.Module):
         self.appearance = AppearanceDecoder(features, config.decoders.appearance_width)
         self.geometry = GeometryDecoder(features, config.decoders.geometry_width, config.max_offset)
         self.skinning = SkinningDecoder(features, config.decoders.skinning_width)
-        self.color_logit = nn.Parameter(torch.logit(torch.tensor(config.color)))
+        self.color = nn.Parameter(torch.logit(torch.tensor(config.color)))
 
     def forward(self) -> CanonicalHand:
         """Evaluate the fields once."""
@@ -113,7 +115,7 @@ class HandSplats(nn.Module):
         features = self.triplane(self.base_points)
         appearance = self.appearance(
             features,
-            self.color_logit.expand(len(features), 3),
+            self.color.expand(len(features), 3),
             torch.logit(features.new_tensor(self.config.opacity)).expand(len(features)),
         )
         points, quats, log_scales = self.base_points, self.base_quats, self.base_log_scales

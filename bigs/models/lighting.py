@@ -3,7 +3,9 @@
 A Gaussian with one fixed colour cannot be lit from above in one frame and from below in the next. Here its
 colour is an albedo times a smooth function of the direction its surface faces in camera space: one quadratic
 function for the clip, and for each subject and frame a linear one, since a hand that closes over the object
-shades itself. (The paper has fixed colours; a run may switch this off.)
+shades itself; for each part of a subject (a hand's bones, an object's regions) a constant as well, since a
+finger shades its neighbour and a hand the side that it holds. (The paper has fixed colours; a run may switch
+this off.)
 """
 
 from __future__ import annotations
@@ -14,6 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from bigs.types import Entity, Gaussians
+
+# A hand has 16 bones; an object is given as many regions.
+N_PARTS = 16
 
 
 class Lighting(nn.Module):
@@ -26,27 +31,30 @@ class Lighting(nn.Module):
     def __init__(self, entities: Iterable[Entity], n_frames: int) -> None:
         super().__init__()
         self.clip = nn.Parameter(torch.zeros(8, 3))
-        # Constant and slope along x, y, z: brightness only, shade has no colour of its own.
-        self.shade = nn.ParameterDict({entity: nn.Parameter(torch.zeros(n_frames, 4)) for entity in entities})
+        # Constant, slope along x, y, z, and parts: brightness only, shade has no colour of its own.
+        self.shade = nn.ParameterDict(
+            {entity: nn.Parameter(torch.zeros(n_frames, 4 + N_PARTS)) for entity in entities}
+        )
 
-    def forward(self, entity: Entity, gaussians: Gaussians, frames: Tensor) -> Gaussians:
+    def forward(self, entity: Entity, gaussians: Gaussians, frames: Tensor, weights: Tensor) -> Gaussians:
         """Lit Gaussians of one entity at `frames` [B]; see `light`."""
-        return light(gaussians, self.clip, self.shade[entity][frames])
+        return light(gaussians, self.clip, self.shade[entity][frames], weights)
 
 
-def light(gaussians: Gaussians, clip: Tensor, shade: Tensor) -> Gaussians:
+def light(gaussians: Gaussians, clip: Tensor, shade: Tensor, weights: Tensor) -> Gaussians:
     """Multiply albedos [N, 3] by the light on each Gaussian's third axis, its outward normal in camera space.
 
     Args:
         gaussians: quats [B, N, 4].
         clip: [8, 3] coefficients of `quadratic_basis` for the whole clip.
-        shade: [B, 4] a constant and a slope for each frame.
+        shade: [B, 4 + J] a constant, a slope, and a constant for each of J parts, for each frame.
+        weights: [N, J] how far a Gaussian belongs to each part.
 
     Returns:
         The Gaussians with colours [B, N, 3].
     """
     normals = third_axis(gaussians.quats)
-    shaded = shade[:, None, :1] + normals @ shade[:, 1:, None]
+    shaded = shade[:, None, :1] + normals @ shade[:, 1:4, None] + weights @ shade[:, 4:, None]
     return gaussians._replace(colors=gaussians.colors * torch.exp(quadratic_basis(normals) @ clip + shaded))
 
 

@@ -1,51 +1,39 @@
-"""The object's Gaussians on their own: what a field said, in finer parts with parameters of their own.
-
-A triplane of 128 texels shows no print on a label, and evaluating it for every finer Gaussian in every step
-would cost ten times the rendering. Once it has given shape and rough colours it is evaluated a last time.
-"""
+"""The object's Gaussians on their own: what a field said, in finer parts without a field behind them."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bigs.checks import InputError
 from bigs.geometry.rotations import quat_to_matrix
+from bigs.models.free_gaussians import FreeGaussians
+from bigs.models.lighting import N_PARTS
 from bigs.models.object_splats import CanonicalObject
 
 # Neighbours at a distance of one over this many standard deviations cover a surface evenly.
 _SIGMA_PER_SPACING = 0.6
-_LEAST_OPACITY, _MOST_OPACITY = 1e-4, 1.0 - 1e-4
 
 
-class ObjectDetail(nn.Module):
+class ObjectDetail(FreeGaussians):
     """A canonical object without a field; takes the place of `ObjectSplats` in a scene."""
 
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; see `split_object`."""
-        super().__init__()
-        self.register_buffer("base_means", torch.zeros(count, 3))
-        self.register_buffer("base_quats", torch.zeros(count, 4))
-        self.register_buffer("base_log_scales", torch.zeros(count, 3))
-        self.register_buffer("opacity_logits", torch.zeros(count))
-        self.register_buffer("color_logits", torch.zeros(count, 3))
-        self.register_buffer("normals", torch.zeros(count, 3))
-        # Along the normal, metres: along the surface others are there already.
-        self.shift = nn.Parameter(torch.zeros(count))
-        self.size = nn.Parameter(torch.zeros(count, 3))  # logarithmic
-        self.opacity = nn.Parameter(torch.zeros(count))  # logit
-        self.color = nn.Parameter(torch.zeros(count, 3))  # logit
+        super().__init__(count)
+        self.register_buffer("weights", torch.zeros(count, N_PARTS))
 
     def forward(self) -> CanonicalObject:
-        offsets = self.shift[:, None] * self.normals
+        offsets = self.offsets
         return CanonicalObject(
             self.base_means + offsets,
             offsets,
             self.base_quats,
-            (self.base_log_scales + self.size).exp(),
-            torch.sigmoid(self.opacity_logits + self.opacity),
-            torch.sigmoid(self.color_logits + self.color),
+            self.scales,
+            self.opacities,
+            self.colors,
             self.normals,
+            self.weights,
         )
 
 
@@ -77,11 +65,14 @@ def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> Ob
         return values[:, None].expand(-1, len(grid), *values.shape[1:]).reshape(count, *values.shape[1:])
 
     detail = ObjectDetail(count)
-    detail.base_means.copy_((means[:, None] + torch.einsum("mij,pj->mpi", axes, grid)).reshape(count, 3))
-    detail.base_quats.copy_(each(quats))
-    smaller = torch.tensor([1.0 / parts, 1.0 / parts, 1.0])
-    detail.base_log_scales.copy_(each(scales * smaller).log())
-    detail.opacity_logits.copy_(torch.logit(each(whole.opacities[kept]).clamp(_LEAST_OPACITY, _MOST_OPACITY)))
-    detail.color_logits.copy_(torch.logit(each(whole.colors[kept]).clamp(1e-3, 1.0 - 1e-3)))
-    detail.normals.copy_(each(whole.normals[kept]))
+    smaller = scales.new_tensor([1.0 / parts, 1.0 / parts, 1.0])
+    detail.start(
+        (means[:, None] + torch.einsum("mij,pj->mpi", axes, grid)).reshape(count, 3),
+        each(quats),
+        each(scales * smaller),
+        each(whole.opacities[kept]),
+        each(whole.colors[kept]),
+        each(whole.normals[kept]),
+    )
+    detail.weights.copy_(each(whole.weights[kept]))
     return detail

@@ -13,6 +13,7 @@ from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecod
 from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.mesh import frames_from_normals, point_spacing
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.models.lighting import N_PARTS
 from bigs.models.poses import ObjectFrames
 from bigs.types import Gaussians
 
@@ -43,6 +44,7 @@ class CanonicalObject(NamedTuple):
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
     normals: Tensor  # [N, 3] unit
+    weights: Tensor  # [N, 16] how far each belongs to the surface's regions; rows sum to one
 
 
 class ObjectSplats(nn.Module):
@@ -66,6 +68,7 @@ class ObjectSplats(nn.Module):
         self.register_buffer("base_log_scales", as_tensor(np.log(scales)))
         self.register_buffer("color_logits", torch.logit(as_tensor(colors).clamp(0.02, 0.98)))
 
+        self.register_buffer("weights", as_tensor(region_weights(points, normals, N_PARTS)))
         bounds = torch.stack([self.base_points.amin(0), self.base_points.amax(0)])
         margin = 0.05 * (bounds[1] - bounds[0]) + config.max_offset
         self.triplane = Triplane(config.triplane, torch.stack([bounds[0] - margin, bounds[1] + margin]))
@@ -90,7 +93,27 @@ class ObjectSplats(nn.Module):
             appearance.opacities,
             appearance.colors,
             self.normals,
+            self.weights,
         )
+
+
+def region_weights(points: np.ndarray, normals: np.ndarray, count: int) -> np.ndarray:
+    """Smooth membership [N, count] of surface points [N, 3] in `count` even regions; rows sum to one.
+
+    A region has a side: its width in metres is also how far apart opposite unit normals [N, 3] count.
+    """
+    # A region's share of the surface, were the points on a sphere as large.
+    width = 2.0 * float(np.sqrt(points.var(0).sum() * 4.0 / count))
+    places = np.concatenate([points, width * normals], axis=1)
+    anchors = [int(np.argmin(((places - places.mean(0)) ** 2).sum(1)))]
+    nearest = np.full(len(places), np.inf)
+    while len(anchors) < count:
+        nearest = np.minimum(nearest, ((places - places[anchors[-1]]) ** 2).sum(1))
+        anchors.append(int(nearest.argmax()))
+    squared = ((places[:, None] - places[anchors]) ** 2).sum(-1)
+    # Relative to the nearest anchor, so that a point far from all still belongs to one.
+    share = np.exp((squared.min(1, keepdims=True) - squared) / (2.0 * (0.5 * width) ** 2))
+    return share / share.sum(1, keepdims=True)
 
 
 def pose_object(obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:

@@ -20,13 +20,13 @@ from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
 from bigs.models.hand_splats import CanonicalHand, skin_hand
-from bigs.models.lighting import light
+from bigs.models.lighting import Lighting, light
 from bigs.models.object_splats import CanonicalObject, pose_object
 from bigs.models.poses import ObjectFrames
 from bigs.models.scene import Scene, concatenate
 from bigs.types import SIDES, Entity, Gaussians, HandObjectTrajectory, Side
 
-FORMAT = "bigs-scene-2"
+FORMAT = "bigs-scene-3"
 
 # What has a value for each frame.
 _MOVING_HAND = (
@@ -46,7 +46,7 @@ class HandPlayback:
     bones: Tensor  # [T, 16, 4, 4] of the canonical (right) hand, mirrored camera for a left hand
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
-    shade: Tensor  # [T, 4] see `lighting.light`
+    shade: Tensor  # [T, 4 + 16] see `lighting.light`
     # The same poses in that side's own MANO convention, x_cam = MANO(orient, pose, betas) + transl
     # about the rest wrist joint; a left hand's model is the mirrored right one.
     global_orient_aa: Tensor  # [T, 3]
@@ -70,7 +70,7 @@ class ObjectPlayback:
     verts: Tensor  # [V, 3] own frame, metres at the initial size
     faces: Tensor  # [F, 3]
     splats: CanonicalObject
-    shade: Tensor  # [T, 4]
+    shade: Tensor  # [T, 4 + 16]
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,11 @@ class Playback:
             if subject.splats.posedirs is not None:
                 points = points + pose_corrective(subject.splats.posedirs, subject.hand_pose[index])
             posed = skin_hand(subject.splats, points, subject.bones[index], entity)
-        return posed if self.light is None else light(posed, self.light, subject.shade[index])
+        return (
+            posed
+            if self.light is None
+            else light(posed, self.light, subject.shade[index], subject.splats.weights)
+        )
 
     def trajectory(self) -> HandObjectTrajectory:
         """Meshes and joints of every frame, camera space, metres."""
@@ -166,9 +170,8 @@ def record(
     frames = torch.arange(scene.n_frames)
     canonical = scene.canonical(scene.entities)
     hands: dict[Side, HandPlayback] = {}
-    shade = {entity: torch.zeros(scene.n_frames, 4) for entity in scene.entities}
-    if scene.lighting is not None:
-        shade |= {entity: value.detach().clone() for entity, value in scene.lighting.shade.items()}
+    lighting = Lighting(scene.entities, scene.n_frames) if scene.lighting is None else scene.lighting
+    shade = {entity: value.detach().clone() for entity, value in lighting.shade.items()}
     for side in scene.sides:
         model, betas = scene.hand_model(side), scene.hand_betas(side)
         pose = scene.hand_frames(side, frames)

@@ -152,7 +152,10 @@ class Scene(nn.Module):
         else:
             pose = self.hand_frames(entity, frames)
             posed = pose_hand(self.hand_model(entity), canonical, self.hand_betas(entity), pose, entity)
-        return posed if self.lighting is None else self.lighting(entity, posed, frames)
+        if self.lighting is None:
+            return posed
+        # Light has no say in how a hand bends.
+        return self.lighting(entity, posed, frames, canonical.weights.detach())
 
     def hand_points(self, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices [B, V, 3] and 21 joints [B, 21, 3] of a hand in camera space, metres."""

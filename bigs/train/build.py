@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,10 +129,28 @@ def _canonical_hands(
     if not shapes:
         return {}
     if config.shared:
-        # The paper takes the right hand's shape for both; two independent estimates of one person's hands
-        # are better averaged.
-        return {"right": (right, torch.stack(list(shapes.values())).mean(0))}
-    return {side: (right, betas) for side, betas in shapes.items()}
+        return {"right": (right, likely_shape(list(shapes.values()), config.shape_error))}
+    return {side: (right, likely_shape([betas], config.shape_error)) for side, betas in shapes.items()}
+
+
+def likely_shape(estimates: Sequence[Tensor], error: float) -> Tensor:
+    """The most likely betas [10] of one person given estimates of both hands, or of one.
+
+    The paper takes the right hand's; two independent estimates are better averaged, and as betas have unit
+    variance among people, an uncertain estimate lies too far out. How uncertain the mean is, both hands'
+    difference tells.
+
+    Args:
+        estimates: one or two shapes [10].
+        error: standard deviation of one estimate where there is no second; 0 takes estimates as they are.
+    """
+    mean = torch.stack(list(estimates)).mean(0)
+    if error == 0.0:
+        return mean
+    variance = error**2
+    if len(estimates) == 2:
+        variance = float((estimates[0] - estimates[1]).square().mean()) / 4.0
+    return mean / (1.0 + variance)
 
 
 def _nearest_colors(points: np.ndarray, start: ObjectStart) -> np.ndarray:

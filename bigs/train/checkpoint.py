@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
+from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
 from bigs.train.loop import NUMBERS, StageState
@@ -98,8 +99,14 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
             f"{path}: expected a checkpoint of this clip, hand model, configuration and version, "
             f"found one of another run (digest {metadata.get('digest')} instead of {digest})"
         )
-    if "scene.object_splats.shift" in tensors and not isinstance(scene.object_splats, ObjectDetail):
-        scene.object_splats = ObjectDetail(len(tensors["scene.object_splats.shift"]))
+    for side, hand in scene.hand_splats.items():
+        if f"scene.hand_splats.{side}.shift" in tensors:
+            scene.hand_splats[side] = free_hand(hand)
+    count = len(tensors.get("scene.object_splats.shift", ()))
+    if count and not (
+        isinstance(scene.object_splats, ObjectDetail) and len(scene.object_splats.shift) == count
+    ):
+        scene.object_splats = ObjectDetail(count)
     scene.load_state_dict(
         {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
     )

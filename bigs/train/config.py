@@ -73,13 +73,15 @@ class GraspStage:
 
 @dataclass(frozen=True)
 class SplitStage:
-    """The object's field is evaluated a last time, and its Gaussians split (see `models.object_detail`)."""
+    """Fields are evaluated a last time, and Gaussians go on without them (see `models.free_gaussians`)."""
 
     name: str = "split"
     step: Step = "single-subject"
-    # Each Gaussian becomes parts x parts smaller ones.
+    # Each Gaussian of the object becomes parts x parts smaller ones.
     parts: int = 2
-    # Gaussians less opaque than this are pruned.
+    # Whether the hands, too, leave their field.
+    hands: bool = True
+    # Gaussians of the object less opaque than this are pruned.
     least_opacity: float = 0.05
 
 

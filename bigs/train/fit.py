@@ -20,6 +20,7 @@ from bigs.data.base import Clip
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights
+from bigs.models.hand_detail import free_hand
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
@@ -149,11 +150,8 @@ def fit(
                 text = f"{side} hand holds the object in frames {spans or '(none)'}"
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, SplitStage):
-            with torch.no_grad():
-                whole = scene.object_splats()
-            scene.object_splats = split_object(whole, stage.parts, stage.least_opacity)
-            text = f"{len(whole.means)} Gaussians of the object become {len(scene.object_splats.shift)}"
-            listen({"event": "note", "stage": stage.name, "text": text})
+            for text in _split(scene, stage):
+                listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, GuidanceStage):
             evidence = sources.evidence(_OBSERVED_AT)
 
@@ -175,6 +173,22 @@ def fit(
         keep(index + 1, None)
     scene.requires_grad_(False)
     return scene, report
+
+
+def _split(scene: Scene, stage: SplitStage) -> list[str]:
+    """Free the scene's Gaussians of their fields; says what became of them."""
+    notes = []
+    if stage.hands:
+        for side, hand in scene.hand_splats.items():
+            scene.hand_splats[side] = free_hand(hand)
+            notes.append(f"{len(scene.hand_splats[side].shift)} Gaussians of the hand are free")
+    if scene.object_splats is not None:
+        with torch.no_grad():
+            whole = scene.object_splats()
+        scene.object_splats = split_object(whole, stage.parts, stage.least_opacity)
+        count = len(scene.object_splats.shift)
+        notes.append(f"{len(whole.means)} Gaussians of the object become {count}")
+    return notes
 
 
 def _continued(saved: FitReport, started: FitReport) -> FitReport:
@@ -259,8 +273,10 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
-    if isinstance(stage, SplitStage | GuidanceStage):
+    if isinstance(stage, GuidanceStage):
         return "the clip has no object" if scene.object_splats is None else None
+    if isinstance(stage, SplitStage):
+        return "the clip has no object" if scene.object_splats is None and not stage.hands else None
     if not stage.weights:
         return "no loss term is left"
     # The clip's light and shade alone are no subject.

@@ -17,17 +17,17 @@ _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
 _HAND_POSE = ("betas", "orient", "pose", "pose_bias", "ray", "depth")
 # Of a whole grasp, relative to the object.
 _GRASP = {"grasp_orient": "orient", "grasp_pose": "pose", "grasp_position": "position"}
-# Of an object that was split.
+# Of Gaussians without a field.
 _DETAIL = ("shift", "size", "opacity", "color")
 _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
-    *(f"hand.{name}" for name in (*_HAND_FIELD, *_HAND_POSE, *_GRASP)),
+    *(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1], *_HAND_POSE, *_GRASP)),
     *(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL, "orient", "ray", "depth", "scale")),
     "scene.light",
     "scene.shade",
 )
 FIELD_GROUPS = {
-    "hand": tuple(f"hand.{name}" for name in _HAND_FIELD),
+    "hand": tuple(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1])),
     "object": tuple(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL)),
 }
 
@@ -44,11 +44,8 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
     if subject == "scene":
         owners = [] if scene.lighting is None else [getattr(scene.lighting, _LIGHT[name])]
     elif subject == "hand":
-        if name in _HAND_FIELD:
-            owners = [
-                splats.color_logit if name == "color" else getattr(splats, name)
-                for splats in scene.hand_splats.values()
-            ]
+        if name in (*_HAND_FIELD, *_DETAIL):
+            owners = _present(scene.hand_splats.values(), name)
         elif name == "betas":
             owners = list(scene.betas.values())
         elif name in _GRASP:
@@ -58,13 +55,17 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
     elif scene.object_splats is None:
         owners = []
     elif name in (*_OBJECT_FIELD, *_DETAIL):
-        # An object has a field until it is split, and parameters of its own from then on.
-        owners = [getattr(scene.object_splats, name)] if hasattr(scene.object_splats, name) else []
+        owners = _present([scene.object_splats], name)
     else:
         owners = [
             scene.object_poses.log_scale if name == "scale" else _pose_parameter(scene.object_poses, name)
         ]
     return [p for owner in owners for p in _parameters(owner)]
+
+
+def _present(splats: Iterable[nn.Module], name: str) -> list[nn.Module | nn.Parameter]:
+    """A subject has a field until its Gaussians are freed of it, and parameters of their own from then on."""
+    return [getattr(one, name) for one in splats if hasattr(one, name)]
 
 
 def _pose_parameter(poses: nn.Module, name: str) -> nn.Parameter:

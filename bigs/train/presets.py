@@ -90,30 +90,39 @@ _APPEARANCE = OptimizeStage(
     frames_per_step=6,
 )
 
-# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once.
+# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
+# have given shape and rough colours; from here on every Gaussian has parameters of its own (`SplitStage`).
 _JOINT = OptimizeStage(
     name="joint",
     step="interacting-subjects",
-    steps=250,
+    steps=150,
     lrs={
         "hand.orient": 0.005,
         "hand.pose": 0.01,
         "hand.ray": 0.0015,
-        "hand.depth": 0.003,
+        "hand.depth": 0.0015,
         "hand.grasp_orient": 0.003,
         "hand.grasp_pose": 0.006,
         "hand.grasp_position": 0.0005,
+        "hand.color": 0.03,
+        "hand.shift": 5e-5,
+        "hand.size": 0.005,
+        "hand.opacity": 0.01,
+        "object.color": 0.05,
+        "object.shift": 1e-4,
+        "object.size": 0.005,
+        "object.opacity": 0.01,
+        "object.orient": 0.002,
+        "object.ray": 0.0005,
+        "scene.light": 2e-3,
+        "scene.shade": 1e-2,
+        # Where fields are kept (--without split).
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
         "hand.geometry": 1e-3,
-        "hand.color": 2e-3,
         "object.triplane": 1e-2,
         "object.appearance": 2e-3,
         "object.geometry": 1e-3,
-        "object.orient": 0.005,
-        "object.ray": 0.0015,
-        "scene.light": 5e-3,
-        "scene.shade": 5e-3,
     },
     weights={
         "image": 4.0,
@@ -123,8 +132,8 @@ _JOINT = OptimizeStage(
         "labels": 0.5,
         "silhouette": 4.0,
         "scale": 100.0,
-        "lbs": 1000.0,
-        "shade_prior": 0.02,
+        "offset": 0.02,
+        "shade_prior": 0.01,
         **_POSE_PRIORS,
         # Colours now say what the prior had to say before.
         "pose_prior": 0.2,
@@ -138,31 +147,26 @@ _JOINT = OptimizeStage(
     frames_per_step=6,
 )
 
-# The object's print: many small Gaussians without a field, alone, at nearly the images' own size. Without
-# SSIM, which would take more time there than all the rest.
-_OBJECT_DETAIL = OptimizeStage(
-    name="object-detail",
-    step="single-subject",
+# The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.
+# Without SSIM and the hands' silhouettes, which would take more time there than all the rest.
+_DETAIL = replace(
+    _JOINT,
+    name="detail",
     steps=60,
     lrs={
-        "object.color": 0.08,
-        "object.shift": 1e-4,
-        "object.size": 0.01,
-        "object.opacity": 0.02,
+        **_JOINT.lrs,
+        "hand.orient": 0.002,
+        "hand.pose": 0.004,
+        "hand.ray": 0.0005,
+        "hand.depth": 0.0005,
+        "hand.grasp_orient": 0.001,
+        "hand.grasp_pose": 0.002,
+        "hand.grasp_position": 0.0002,
+        "object.shift": 3e-5,
         "object.orient": 0.0007,
         "object.ray": 0.0002,
-        # Not the clip's light, which the hands share, and no prior on shade below: hands are not seen here,
-        # and nothing would hold against it.
-        "scene.shade": 2e-3,
     },
-    weights={
-        "image": 4.0,
-        "mse": 30.0,
-        "coverage": 0.2,
-        "scale": 100.0,
-        "object_prior": 0.1,
-        "object_acceleration": 0.005,
-    },
+    weights={name: weight for name, weight in _JOINT.weights.items() if name not in ("ssim", "silhouette")},
     image_size=480,
     frames_per_step=8,
 )
@@ -179,9 +183,9 @@ FAST = RunConfig(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
-        replace(_JOINT, steps=180),
         SplitStage(),
-        _OBJECT_DETAIL,
+        _JOINT,
+        _DETAIL,
         GuidanceStage(),
     ),
 )
@@ -198,6 +202,7 @@ DEMO = replace(
         replace(_APPEARANCE, steps=40),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
+        SplitStage(),
         replace(_JOINT, steps=110),
         GuidanceStage(steps=150),
     ),
@@ -218,17 +223,9 @@ FULL = replace(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=100, image_size=160),
-        replace(_JOINT, steps=700),
-        replace(
-            _JOINT,
-            name="joint-fine",
-            steps=300,
-            lrs={name: 0.3 * lr for name, lr in _JOINT.lrs.items()},
-            image_size=480,
-            frames_per_step=4,
-        ),
         SplitStage(),
-        replace(_OBJECT_DETAIL, steps=200, image_size=640),
+        replace(_JOINT, steps=400),
+        replace(_DETAIL, steps=400, image_size=640),
         GuidanceStage(steps=600),
     ),
 )
@@ -248,9 +245,9 @@ SMOKE = replace(
         replace(_HELD, steps=8, image_size=80),
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
-        replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
         SplitStage(),
-        replace(_OBJECT_DETAIL, steps=6, image_size=120, frames_per_step=3),
+        replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
+        replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),
         GuidanceStage(steps=4, views=2),
     ),
 )
@@ -261,7 +258,7 @@ SMOKE = replace(
 _PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "color": 0.1, "scale": 100.0, "mask": 10.0}
 PAPER = RunConfig(
     initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
-    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3),
+    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3, shape_error=0.0),
     object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000),
     lighting=False,
     contact="center",

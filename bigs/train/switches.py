@@ -165,13 +165,16 @@ _INGREDIENTS = {
         _terms("orient_prior", "pose_prior", "betas_prior", "object_prior"),
     ),
     "hand_geometry": Switch(
-        "offset, rotation and scale of the hand's Gaussians by the field",
+        "what moves, turns and scales the hand's Gaussians",
         _all_of(
             lambda config: replace(config, hand=replace(config.hand, learn_geometry=False)),
-            _groups("hand.geometry"),
+            _groups("hand.geometry", "hand.shift", "hand.size"),
         ),
     ),
-    "split": Switch("the object's split into finer Gaussians", lambda c: _keep(c, leave_out=SplitStage)),
+    "split": Switch(
+        "Gaussians that leave their fields, the object's in finer parts",
+        lambda c: _keep(c, leave_out=SplitStage),
+    ),
     "pyramid": Switch("coarse images before fine ones", _pyramid),
     "stopping": Switch(
         "early stopping", lambda config: _keep(config, lambda stage: replace(stage, stop_patience=0))

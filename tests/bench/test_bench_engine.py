@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from command_line import Answer, assert_refused
 
-from bigs import _raster, cli
+from bigs import _raster
 from bigs.bench import worker
 from bigs.bench.calls import Call, Task, centre_mask
 from bigs.bench.curve import SETTINGS, every_pair
@@ -23,6 +23,7 @@ from bigs.bench.peers import PEERS
 from bigs.bench.plan import PARTS, Plan
 from bigs.bench.skips import SKIPS
 from bigs.bench.workloads import KINDS, WorkloadSpec
+from bigs.cli import bench as cli
 from bigs.raster import RasterSettings
 
 TINY = WorkloadSpec("A", scale=0.005)

@@ -8,6 +8,7 @@ from bigs.models.lighting import Lighting, light, quadratic_basis, third_axis
 from bigs.types import Gaussians
 
 B, N = 3, 8
+NO_PARTS = torch.zeros(N, 0)
 
 
 def gaussians(dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -29,12 +30,12 @@ def test_third_axis_is_the_rotations_third_column() -> None:
 
 def test_without_coefficients_colours_are_the_albedo() -> None:
     given = gaussians()
-    lit = light(given, torch.zeros(8, 3), torch.zeros(B, 4))
+    lit = light(given, torch.zeros(8, 3), torch.zeros(B, 4), NO_PARTS)
     assert torch.equal(lit.colors, given.colors.expand(B, N, 3))
     for name in ("means", "quats", "scales", "opacities"):
         assert getattr(lit, name) is getattr(given, name)
     fresh = Lighting(["object"], 5)
-    assert torch.equal(fresh("object", given, torch.tensor([0, 4, 2])).colors, lit.colors)
+    assert torch.equal(fresh("object", given, torch.tensor([0, 4, 2]), torch.rand(N, 16)).colors, lit.colors)
 
 
 def test_light_by_hand() -> None:
@@ -47,17 +48,36 @@ def test_light_by_hand() -> None:
     clip[1, 0], clip[2, 1], clip[7, 2] = 0.3, 0.4, 0.1  # red by y, green by z, blue by 3 z^2 - 1
     shade = torch.tensor([[0.2, 0.0, 0.5, 0.0], [0.0, 9.0, 9.0, -0.7]])
     exponents = torch.tensor([[0.3, 0.0, -0.1], [0.0, -0.4, 0.2]]) + torch.tensor([[0.7], [0.7]])
-    torch.testing.assert_close(light(given, clip, shade).colors[:, 0], 0.5 * exponents.exp())
+    torch.testing.assert_close(
+        light(given, clip, shade, torch.zeros(1, 0)).colors[:, 0], 0.5 * exponents.exp()
+    )
+
+
+def test_parts_have_a_shade_of_their_own() -> None:
+    """Gaussian 0 belongs to part 2, Gaussian 1 to parts 2 and 5 alike; frame 1 darkens part 2 alone."""
+    given = gaussians()
+    weights = torch.zeros(N, 16)
+    weights[0, 2] = 1.0
+    weights[1, 2] = weights[1, 5] = 0.5
+    lighting = Lighting(["right"], B)
+    with torch.no_grad():
+        lighting.shade["right"][1, 4 + 2] = -0.4
+    ratio = lighting("right", given, torch.arange(B), weights).colors / given.colors
+    torch.testing.assert_close(ratio[1, 0], torch.full((3,), -0.4).exp())
+    torch.testing.assert_close(ratio[1, 1], torch.full((3,), -0.2).exp())
+    assert (ratio[1, 2:] == 1).all() and (ratio[[0, 2]] == 1).all()
 
 
 def test_light_is_positive_and_keeps_black_black() -> None:
     given = gaussians()
     generator = torch.Generator().manual_seed(2)
-    lit = light(given, 5.0 * torch.randn(8, 3, generator=generator), torch.randn(B, 4, generator=generator))
+    lit = light(
+        given, 5.0 * torch.randn(8, 3, generator=generator), torch.randn(B, 4, generator=generator), NO_PARTS
+    )
     assert (lit.colors > 0).all() and lit.colors.isfinite().all()
     assert lit.colors.std() > 0.1
     black = given._replace(colors=torch.zeros(N, 3))
-    assert not light(black, torch.ones(8, 3), torch.ones(B, 4)).colors.any()
+    assert not light(black, torch.ones(8, 3), torch.ones(B, 4), NO_PARTS).colors.any()
 
 
 def test_the_basis_has_no_constant_and_is_orthogonal_over_the_sphere() -> None:
@@ -78,25 +98,29 @@ def test_each_entity_and_frame_has_its_own_shade() -> None:
     with torch.no_grad():
         lighting.shade["object"][4, 0] = 1.0
     frames = torch.tensor([0, 4, 2])
-    lit = lighting("object", given, frames).colors / given.colors
+    lit = lighting("object", given, frames, torch.zeros(N, 16)).colors / given.colors
     torch.testing.assert_close(lit[1], torch.full((N, 3), torch.e))
     assert (lit[[0, 2]] == 1).all()
-    assert (lighting("right", given, frames).colors == given.colors).all()
-    lighting("object", given, frames).colors.sum().backward()
+    assert (lighting("right", given, frames, torch.rand(N, 16)).colors == given.colors).all()
+    lighting("object", given, frames, torch.zeros(N, 16)).colors.sum().backward()
     assert lighting.shade["object"].grad.abs().sum(1).nonzero()[:, 0].tolist() == [0, 2, 4]
     assert lighting.shade["right"].grad is None
 
 
 @pytest.mark.parametrize("zero", [True, False])
-def test_gradients(zero: bool) -> None:
+@pytest.mark.parametrize("parts", [0, 3])
+def test_gradients(zero: bool, parts: int) -> None:
     given = gaussians(torch.float64)
     generator = torch.Generator().manual_seed(3)
-    clip, shade = (torch.randn(*s, generator=generator, dtype=torch.float64) for s in ((8, 3), (B, 4)))
+    clip, shade = (
+        torch.randn(*s, generator=generator, dtype=torch.float64) for s in ((8, 3), (B, 4 + parts))
+    )
+    weights = torch.rand(N, parts, generator=generator, dtype=torch.float64)
     if zero:
         clip, shade = torch.zeros_like(clip), torch.zeros_like(shade)
 
     def colors(quats, albedo, clip, shade):
-        return light(given._replace(quats=quats, colors=albedo), clip, shade).colors
+        return light(given._replace(quats=quats, colors=albedo), clip, shade, weights).colors
 
     inputs = [x.clone().requires_grad_() for x in (given.quats, given.colors, clip, shade)]
     assert torch.autograd.gradcheck(colors, inputs)

@@ -20,7 +20,9 @@ def plate(side: int = 8, spacing: float = 0.01) -> CanonicalObject:
     scales = torch.tensor([0.6 * spacing, 0.6 * spacing, 0.1 * spacing]).repeat(count, 1)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     normals = torch.tensor([0.0, 0.0, -1.0]).repeat(count, 1)
-    return CanonicalObject(means, 0 * means, quats, scales, torch.full((count,), 0.95), colors, normals)
+    weights = torch.eye(16)[torch.arange(count) % 16]
+    opacities = torch.full((count,), 0.95)
+    return CanonicalObject(means, 0 * means, quats, scales, opacities, colors, normals, weights)
 
 
 def picture(obj: CanonicalObject) -> torch.Tensor:
@@ -32,7 +34,7 @@ def picture(obj: CanonicalObject) -> torch.Tensor:
 def test_one_part_is_the_same_object() -> None:
     whole = plate()
     same = split_object(whole, 1, 0.0)()
-    for name in ("means", "quats", "scales", "opacities", "colors", "normals"):
+    for name in ("means", "quats", "scales", "opacities", "colors", "normals", "weights"):
         torch.testing.assert_close(getattr(same, name), getattr(whole, name), atol=1e-5, rtol=1e-4)
     assert not same.offsets.any()
 

@@ -9,7 +9,7 @@ from small_scene import OBJECT, OBJECT_RADIUS, covariances, disturb, object_spla
 
 from bigs.geometry.mesh import point_spacing
 from bigs.models.lighting import third_axis
-from bigs.models.object_splats import ObjectSplats, pose_object
+from bigs.models.object_splats import ObjectSplats, pose_object, region_weights
 from bigs.models.poses import ObjectFrames
 
 
@@ -98,3 +98,20 @@ def test_every_part_of_the_object_learns() -> None:
     generator = torch.Generator().manual_seed(5)
     sum((value * torch.randn(value.shape, generator=generator)).sum() for value in posed).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() and p.grad.any() for p in made.parameters())
+
+
+def test_regions_are_smooth_even_and_have_a_side() -> None:
+    """On a thin plate: every region is somebody's, neighbours agree, and front and back do not mix."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 30), np.linspace(-0.05, 0.05, 15)), -1).reshape(-1, 2)
+    sides = np.repeat([0.001, -0.001], len(grid))
+    points = np.c_[np.tile(grid, (2, 1)), sides]
+    normals = np.c_[np.zeros((len(points), 2)), np.sign(sides)]
+    weights = region_weights(points, normals, 16)
+    np.testing.assert_allclose(weights.sum(1), 1.0, atol=1e-9)
+    assert weights.min() >= 0 and weights.max(0).min() > 0.5
+    owned = np.bincount(weights.argmax(1), minlength=16)
+    assert owned.min() > 0.2 * len(points) / 16 and owned.max() < 3 * len(points) / 16
+    steps = np.abs(np.diff(weights[:30], axis=0)).sum(1)
+    assert steps.max() < 0.5
+    front, back = weights[: len(grid)].sum(0), weights[len(grid) :].sum(0)
+    assert (np.minimum(front, back) < 0.3 * np.maximum(front, back)).all()

@@ -14,6 +14,7 @@ from toy_scenes import cube_scene
 
 from bigs.checks import InputError
 from bigs.hand import HandModel
+from bigs.models.hand_detail import free_hand
 from bigs.models.hand_splats import silhouette_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
@@ -137,8 +138,9 @@ def test_every_group_can_be_reached_by_some_term(scene: Scene, evidence: Evidenc
     )
     if group.startswith("scene"):
         stage = replace(stage, lrs={group: 1e-2, "hand.color": 1e-3})
-    if group.removeprefix("object.") in ("shift", "size", "opacity", "color"):
+    if group.split(".")[1] in ("shift", "size", "opacity", "color"):
         scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
+        scene.hand_splats["right"] = free_hand(scene.hand_splats["right"])
     if "grasp" in group:
         find_grasps(scene, GraspStage(least=2), evidence.touching)
     # A fresh decoder's last layer is zero, so what lies below it gets a gradient from the second step on.

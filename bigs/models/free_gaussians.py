@@ -1,0 +1,59 @@
+"""Gaussians with parameters of their own: what is left of a field once it has been evaluated a last time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+_LEAST_OPACITY, _MOST_OPACITY = 1e-4, 1.0 - 1e-4
+
+
+class FreeGaussians(nn.Module):
+    """Canonical Gaussians around a start; `moved`, `scales`, ... are what the parameters make of it.
+
+    A triplane shows no print on a label and no crease in a palm, and evaluating it in every step costs more
+    than the rendering. Optimisation goes on with a displacement, size, opacity and colour for each Gaussian.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Room for `count` Gaussians; `start` fills it."""
+        super().__init__()
+        self.register_buffer("base_means", torch.zeros(count, 3))
+        self.register_buffer("base_quats", torch.zeros(count, 4))
+        self.register_buffer("base_log_scales", torch.zeros(count, 3))
+        self.register_buffer("opacity_logits", torch.zeros(count))
+        self.register_buffer("color_logits", torch.zeros(count, 3))
+        self.register_buffer("normals", torch.zeros(count, 3))
+        # Along the normal, metres: along the surface others are there already.
+        self.shift = nn.Parameter(torch.zeros(count))
+        self.size = nn.Parameter(torch.zeros(count, 3))  # logarithmic
+        self.opacity = nn.Parameter(torch.zeros(count))  # logit
+        self.color = nn.Parameter(torch.zeros(count, 3))  # logit
+
+    def start(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, normals: Tensor
+    ) -> None:
+        """Begin from N Gaussians as `types.Gaussians` has them, and their unit normals [N, 3]."""
+        self.base_means.copy_(means)
+        self.base_quats.copy_(quats)
+        self.base_log_scales.copy_(scales.log())
+        self.opacity_logits.copy_(torch.logit(opacities.clamp(_LEAST_OPACITY, _MOST_OPACITY)))
+        self.color_logits.copy_(torch.logit(colors.clamp(1e-3, 1.0 - 1e-3)))
+        self.normals.copy_(normals)
+
+    @property
+    def offsets(self) -> Tensor:
+        """[N, 3] metres from the start."""
+        return self.shift[:, None] * self.normals
+
+    @property
+    def scales(self) -> Tensor:
+        return (self.base_log_scales + self.size).exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        return torch.sigmoid(self.opacity_logits + self.opacity)
+
+    @property
+    def colors(self) -> Tensor:
+        return torch.sigmoid(self.color_logits + self.color)

@@ -1,0 +1,50 @@
+"""The canonical hand's Gaussians on their own, without a field behind them."""
+
+from __future__ import annotations
+
+import torch
+
+from bigs.geometry.rotations import quat_to_matrix
+from bigs.hand import HandModel
+from bigs.models.free_gaussians import FreeGaussians
+from bigs.models.hand_splats import CanonicalHand, HandSplats
+
+
+class HandDetail(FreeGaussians):
+    """A canonical right hand without a field; takes the place of `HandSplats` in a scene.
+
+    How its Gaussians follow the shape and the bones is settled: it stays as the field left it.
+    """
+
+    def __init__(self, model: HandModel, splats: CanonicalHand) -> None:
+        """`model` is the right hand; `splats` says how many Gaussians, and how they follow shape and pose."""
+        super().__init__(len(splats.points))
+        self.model = model
+        self.register_buffer("shapedirs", splats.shapedirs.detach().clone(), persistent=False)
+        has_posedirs = splats.posedirs is not None
+        posedirs = splats.posedirs.detach().clone() if has_posedirs else None
+        self.register_buffer("posedirs", posedirs, persistent=False)
+        self.register_buffer("base_weights", splats.weights.detach().clone())
+
+    def forward(self) -> CanonicalHand:
+        return CanonicalHand(
+            self.base_means + self.offsets,
+            self.shapedirs,
+            self.posedirs,
+            self.base_weights,
+            self.base_quats,
+            self.scales,
+            self.opacities,
+            self.colors,
+        )
+
+
+@torch.no_grad()
+def free_hand(hand: HandSplats | HandDetail) -> HandDetail:
+    """The Gaussians as they are now, from here on without a field."""
+    whole = hand()
+    detail = HandDetail(hand.model, whole)
+    # A Gaussian is thin along its third axis, the surface's outward normal.
+    normals = quat_to_matrix(whole.quats)[..., 2]
+    detail.start(whole.points, whole.quats, whole.scales, whole.opacities, whole.colors, normals)
+    return detail

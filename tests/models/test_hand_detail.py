@@ -1,0 +1,63 @@
+"""Hands without a field: the same hand at first, then Gaussians of their own that follow the same bones."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bigs.models.hand_detail import HandDetail, free_hand
+from bigs.models.hand_splats import HandSplats, HandSplatsConfig, pose_hand
+from bigs.models.poses import HandFrames
+
+
+@pytest.fixture
+def field(both_hands) -> HandSplats:
+    torch.manual_seed(0)
+    splats = HandSplats(both_hands["right"], HandSplatsConfig(subdivisions=0))
+    with torch.no_grad():  # a field that says something
+        for parameter in splats.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    return splats
+
+
+def test_a_freed_hand_is_the_same_hand(field: HandSplats) -> None:
+    before, after = field(), free_hand(field)()
+    for name, value in before._asdict().items():
+        if value is None:
+            assert getattr(after, name) is None
+        else:
+            torch.testing.assert_close(getattr(after, name), value, atol=1e-5, rtol=1e-4)
+            assert (
+                name in ("points", "scales", "opacities", "colors") or not getattr(after, name).requires_grad
+            )
+
+
+def test_it_follows_shape_and_bones_as_before(field: HandSplats) -> None:
+    generator = torch.Generator().manual_seed(1)
+    turns = torch.linalg.qr(torch.randn(2, 15, 3, 3, generator=generator))[0]
+    turns = turns * torch.linalg.det(turns)[..., None, None]
+    frames = HandFrames(torch.eye(3).repeat(2, 1, 1), turns, torch.randn(2, 3, generator=generator))
+    betas = torch.randn(10, generator=generator)
+    posed = [pose_hand(field.model, hand, betas, frames, "left") for hand in (field(), free_hand(field)())]
+    torch.testing.assert_close(posed[1].means, posed[0].means, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(posed[1].quats, posed[0].quats, atol=1e-5, rtol=1e-5)
+
+
+def test_a_shift_goes_along_the_thin_axis(field: HandSplats) -> None:
+    detail = free_hand(field)
+    before = detail().points
+    with torch.no_grad():
+        detail.shift[7] = 0.001
+    moved = detail().points - before
+    torch.testing.assert_close(moved[7], 0.001 * detail.normals[7], atol=1e-7, rtol=1e-3)
+    torch.testing.assert_close(moved[7].norm(), torch.tensor(0.001), atol=1e-6, rtol=1e-3)
+    assert not moved[:7].any() and not moved[8:].any()
+
+
+def test_freed_twice_is_freed_once(field: HandSplats) -> None:
+    once = free_hand(field)
+    with torch.no_grad():
+        once.color.add_(0.3)
+    twice = free_hand(once)
+    assert isinstance(twice, HandDetail) and not twice.color.any()
+    torch.testing.assert_close(twice().colors, once().colors)
