@@ -28,6 +28,7 @@ from bigs.guidance.diffusers_folder import Device, choose
 from bigs.guidance.pixel import PIXELS, PixelConfig
 from bigs.guidance.pixel_file import save_pixel_net
 from bigs.guidance.pixel_training import Pictures, PixelTraining, PixelTrainingConfig
+from bigs.models.lighting import N_PARTS
 from bigs.models.object_splats import CanonicalObject
 from bigs.raster.settings import RasterSettings
 from bigs.train.guided import render_object
@@ -177,6 +178,7 @@ def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
         torch.full((len(means),), 0.95),
         as_tensor(colors[nearest]),
         as_tensor(normals),
+        torch.zeros(len(means), N_PARTS),  # nothing shades it
     )
 
 

@@ -13,6 +13,7 @@ from bigs.geometry.mesh import frames_from_normals, sample_surface, vertex_norma
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.guidance import Conditions
 from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
+from bigs.models.lighting import N_PARTS
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.object_splats import CanonicalObject
 from bigs.raster import RasterSettings
@@ -54,6 +55,7 @@ def gaussians(points: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> Ca
         torch.full((len(means),), 0.95),
         as_tensor(colors),
         as_tensor(normals),
+        torch.zeros(len(means), N_PARTS),
     )
 
 
