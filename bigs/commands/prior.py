@@ -92,7 +92,7 @@ def fit_token(
     inversion = Inversion(parts, config)
     origin = _digest(clip, config, model, controlnet, edge_weights)
     if kept.exists():
-        _restore(inversion, kept, origin)
+        inversion.restore(*read_state(kept, FORMAT, origin, "this clip, model and options"))
     crops = [_cut(clip, frame, parts.image_size) for frame in frames]
     weights_gib = sum(p.nbytes for network in parts.networks for p in network.parameters()) / _GIB
     listen({"event": "start", "frames": len(frames), "weights_gib": weights_gib, "step": inversion.step})
@@ -152,7 +152,12 @@ def _keep(inversion: Inversion, path: Path, origin: str) -> None:
         file.write(save(inversion.state(), metadata))
 
 
-def _restore(inversion: Inversion, path: Path, origin: str) -> None:
+def read_state(path: Path, form: str, origin: str, of_what: str) -> tuple[dict[str, torch.Tensor], int]:
+    """What was kept of a training, and after how many steps.
+
+    Raises:
+        InputError: damaged, or not of this `form` and `origin`; `of_what` says what those depend on.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -161,12 +166,11 @@ def _restore(inversion: Inversion, path: Path, origin: str) -> None:
         raise InputError(
             f"{path}: expected a readable state, found: {error} (remove it to start anew)"
         ) from error
-    if metadata.get("format") != FORMAT or metadata.get("origin") != origin:
+    if metadata.get("format") != form or metadata.get("origin") != origin:
         raise InputError(
-            f"{path}: expected a state of this clip, model and options, found one of others (remove it to "
-            "start anew)"
+            f"{path}: expected a state of {of_what}, found one of others (remove it to start anew)"
         )
-    inversion.restore(state, int(metadata["step"]))
+    return state, int(metadata["step"])
 
 
 def _peak_gib(parts: Parts) -> float:

@@ -13,13 +13,12 @@ import numpy as np
 import scipy.spatial
 import torch
 import trimesh
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
-from bigs.commands.prior import state_path
+from bigs.commands.prior import read_state, state_path
 from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
@@ -89,7 +88,7 @@ def train_prior(
     training = PixelTraining(config, choose(device, "float32")[0])
     origin = _digest(files, config, views, up)
     if kept.exists():
-        _restore(training, kept, origin)
+        training.restore(*read_state(kept, FORMAT, origin, "these meshes and options"))
     parts = [mesh_pictures(file, views, up, config.seed + index) for index, file in enumerate(files)]
     pictures = Pictures(*(torch.cat(part) for part in zip(*parts, strict=True)))
     parameters = sum(p.numel() for p in training.net.parameters())
@@ -125,23 +124,6 @@ def _digest(files: list[Path], config: PixelTrainingConfig, views: int, up: str)
     for file in files:
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def _restore(training: PixelTraining, path: Path, origin: str) -> None:
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path}: expected a readable state, found: {error} (remove it to start anew)"
-        ) from error
-    if metadata.get("format") != FORMAT or metadata.get("origin") != origin:
-        raise InputError(
-            f"{path}: expected a state of these meshes and options, found one of others (remove it to start "
-            "anew)"
-        )
-    training.restore(tensors, int(metadata["step"]))
 
 
 def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
