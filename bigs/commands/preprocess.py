@@ -10,6 +10,7 @@ from bigs.commands.preprocess_request import STEPS, PreprocessRequest, StepName,
 from bigs.commands.preprocess_steps import (
     build_step,
     frames_step,
+    hand_source,
     hands_step,
     masks_step,
 )
@@ -45,6 +46,9 @@ def preprocess(
     outcomes = []
     for name in STEPS:
         if name in steps:
+            if name == "object" and "hands" in steps:
+                # Said now, not after the minutes that this step takes.
+                hand_source(request)
             listen(name)
             began = time.perf_counter()
             outcome = RUN[name](request, _under_name(name, listen))

@@ -12,7 +12,7 @@ import numpy as np
 
 from bigs.checks import InputError
 from bigs.commands.preprocess_pictures import with_points, with_skeletons, write_sheet
-from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
+from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome, kept
 from bigs.data.images import read_image, read_mask
 from bigs.hand import load_hand_models
 from bigs.preprocess.align import AlignConfig, align
@@ -30,6 +30,7 @@ from bigs.preprocess.artefacts import (
     read_alignment,
     read_frame_set,
     read_hands,
+    read_notes,
     read_object_sfm,
     write_alignment,
     write_frame_set,
@@ -60,9 +61,9 @@ def object_step(request: PreprocessRequest, listen: Callable[[str], None]) -> St
     weights = _weights(request)
     state = request.state(file, _object_inputs(processed, frames, config, weights))
     if state in ("current", "supplied"):
-        stored = _stored_notes(report_file) if state == "current" else ()
+        stored = read_notes(report_file) if state == "current" else ()
         summary = _object_summary(read_object_sfm(file, count))
-        return _kept("object", state, summary, stored, picture)
+        return kept("object", state, summary, picture, stored)
     matcher = load_matcher(*weights) if weights else None
     listen("finding features")
     labels = _labels(processed, frames)
@@ -96,7 +97,7 @@ def align_step(request: PreprocessRequest, listen: Callable[[str], None]) -> Ste
         summary = _alignment_summary(
             read_alignment(file, count), read_object_sfm(processed / SFM_FILE, count)
         )
-        return _kept("align", state, summary, (), picture)
+        return kept("align", state, summary, picture)
     listen("searching the object's size")
     models = load_hand_models(request.hand_model)
     hands = read_hands(processed / HANDS_FILE, count)
@@ -182,20 +183,6 @@ def _object_summary(sfm: ObjectSfm) -> str:
 def _alignment_summary(alignment: Alignment, sfm: ObjectSfm) -> str:
     size = alignment.scale * float(np.ptp(sfm.points, axis=0).max())
     return f"object about {100.0 * size:.0f} cm, {np.median(alignment.object_transl[:, 2]):.2f} m away"
-
-
-def _stored_notes(file: Path) -> tuple[str, ...]:
-    if not file.exists():
-        return ()
-    try:
-        return tuple(str(note) for note in json.loads(file.read_text(encoding="utf-8"))["notes"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: expected a report with notes, found {error}") from None
-
-
-def _kept(name: Any, state: str, summary: str, notes: tuple[str, ...], picture: Path) -> StepOutcome:
-    kept = "supplied" if state == "supplied" else "up to date"
-    return StepOutcome(name, kept, summary, notes, picture if picture.exists() else None)  # type: ignore[arg-type]
 
 
 def _draw_object(picture: Path, processed: Path, frames: FrameSet, sfm: ObjectSfm) -> None:

@@ -54,3 +54,14 @@ class StepOutcome(NamedTuple):
     notes: tuple[str, ...]
     picture: Path | None
     seconds: float = 0.0
+
+
+def kept(
+    name: StepName, state: State, summary: str, picture: Path, notes: tuple[str, ...] = ()
+) -> StepOutcome:
+    """The outcome of a step that has nothing to do."""
+    shown = picture if picture.exists() else None
+    if state == "supplied":
+        notes = (*notes, "kept as another tool supplied it; remove it, or pass --redo, to have it made")
+        return StepOutcome(name, "supplied", summary, notes, shown)
+    return StepOutcome(name, "up to date", summary, notes, shown)

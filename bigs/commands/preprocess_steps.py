@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from bigs.checks import InputError
 from bigs.commands.preprocess_pictures import draw_clip, tinted, with_skeletons, write_sheet
-from bigs.commands.preprocess_request import PreprocessRequest, StepName, StepOutcome
+from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome, kept
 from bigs.data.base import HandTrack
 from bigs.data.hold import load_hold
 from bigs.data.images import read_image, read_mask
@@ -25,13 +24,13 @@ from bigs.preprocess.artefacts import (
     MASKS_FILE,
     SFM_FILE,
     FrameSet,
-    State,
     content_digest,
     frame_paths,
     mask_paths,
     read_alignment,
     read_frame_set,
     read_hands,
+    read_notes,
     read_object_sfm,
     write_hands,
     write_json,
@@ -71,7 +70,7 @@ def frames_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     if state in ("current", "supplied"):
         frames = read_frame_set(processed)
         frame_paths(processed, frames)
-        return _kept("frames", state, _frames_summary(frames), picture)
+        return kept("frames", state, _frames_summary(frames), picture)
     frames = extract_frames(source, processed, request.frames, inputs, listen)
     write_sheet(picture, frame_paths(processed, frames), frames.names, lambda t, image: image)
     notes = (
@@ -96,7 +95,7 @@ def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     state = request.state(file, inputs)
     if state in ("current", "supplied"):
         mask_paths(processed, frames)
-        return _kept("masks", state, "as they are", picture, _stored_notes(file))
+        return kept("masks", state, "as they are", picture, read_notes(file))
     source = label_source()
     found: list[str] = []
 
@@ -114,22 +113,14 @@ def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     processed = request.processed
     frames = read_frame_set(processed)
     file, picture = processed / HANDS_FILE, processed / "hands.png"
-    sources = {
-        "--keypoints": request.keypoints,
-        "--hands": request.hands,
-        "--landmarker": request.landmarker,
-    }
-    given = [name for name, value in sources.items() if value is not None]
-    if len(given) > 1:
-        raise InputError(f"hands: expected one of {', '.join(sources)}, found {' and '.join(given)}")
-    if not given:
-        return _supplied_hands(file, len(frames.names))
-    source = sources[given[0]]
-    if source is None or not source.exists():
-        raise InputError(f"{source}: expected a file for {given[0]}, found nothing")
+    chosen = hand_source(request)
+    if chosen is None:
+        hands = read_hands(file, len(frames.names))
+        return StepOutcome("hands", "supplied", _hands_summary(hands), (), None)
+    option, source = chosen
     config = HandFitConfig()
     inputs = content_digest(
-        given[0],
+        option,
         source,
         _frame_identity(frames),
         frames.K,
@@ -139,17 +130,17 @@ def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     )
     state = request.state(file, inputs)
     if state in ("current", "supplied"):
-        return _kept("hands", state, _hands_summary(read_hands(file, len(frames.names))), picture)
+        return kept("hands", state, _hands_summary(read_hands(file, len(frames.names))), picture)
     models = load_hand_models(request.hand_model)
     labels = None
     if (processed / MASKS_FILE).exists():
         labels = [read_mask(path) for path in mask_paths(processed, frames)]
-    if given == ["--hands"]:
+    if option == "--hands":
         means = {side: model.hands_mean.double().numpy() for side, model in models.items()}
         listen("reading")
         found = import_hands(read_hand_dump(source, frames, means), frames.K, models, labels)
     else:
-        if given == ["--landmarker"]:
+        if option == "--landmarker":
             keypoints = find_keypoints(source, frame_paths(processed, frames), frames.fps, listen)
             write_keypoints(processed / "keypoints.json", keypoints, frames)
         else:
@@ -159,6 +150,36 @@ def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     write_hands(file, found.tracks, inputs)
     _draw_hands(picture, processed, frames, found, models)
     return StepOutcome("hands", "made", _hands_summary(found.tracks), found.notes, picture)
+
+
+def hand_source(request: PreprocessRequest) -> tuple[str, Path] | None:
+    """The option and the file that the hands come from; None for the artefact that is there.
+
+    Raises:
+        InputError: several are given, there is no such file, or there is nothing at all.
+    """
+    sources = {
+        "--keypoints": request.keypoints,
+        "--hands": request.hands,
+        "--landmarker": request.landmarker,
+    }
+    given = [(name, value) for name, value in sources.items() if value is not None]
+    if len(given) > 1:
+        found = " and ".join(name for name, _ in given)
+        raise InputError(f"hands: expected one of {', '.join(sources)}, found {found}")
+    if not given:
+        file = request.processed / HANDS_FILE
+        if not file.exists():
+            raise InputError(
+                f"{file}: expected estimates of the hands, found none; give --keypoints FILE (21 points "
+                f"of each "
+                "hand), or --hands FILE of another hand estimator"
+            )
+        return None
+    option, source = given[0]
+    if not source.exists():
+        raise InputError(f"{source}: expected a file for {option}, found nothing")
+    return option, source
 
 
 def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
@@ -171,7 +192,7 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     inputs = content_digest(*parts, frames.K, _model_identity(request))
     ours = stamp.exists()
     if request.state(stamp, inputs) == "current" and (request.clip / "build" / "data.npy").is_file():
-        return _kept("build", "current", str(request.clip / "build"), picture)
+        return kept("build", "current", str(request.clip / "build"), picture)
     models = load_hand_models(request.hand_model)
     images, masks = frame_paths(processed, frames), mask_paths(processed, frames)
     build = write_build(
@@ -198,7 +219,7 @@ def _supplied_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOut
     file = processed / MASKS_FILE
     if file.exists():
         mask_paths(processed, frames)
-        return StepOutcome("masks", "supplied", "as they are", _stored_notes(file), None)
+        return StepOutcome("masks", "supplied", "as they are", read_notes(file), None)
     if not (processed / MASKS).is_dir():
         raise InputError(
             f"{processed / MASKS}: expected masks of hands and object, found none; give --masks DIR, "
@@ -249,15 +270,6 @@ def _sam2_masks(
     return inputs, make
 
 
-def _supplied_hands(file: Path, frames: int) -> StepOutcome:
-    if not file.exists():
-        raise InputError(
-            f"{file}: expected estimates of the hands, found none; give --keypoints FILE (21 points of each "
-            "hand), or --hands FILE of another hand estimator"
-        )
-    return StepOutcome("hands", "supplied", _hands_summary(read_hands(file, frames)), (), None)
-
-
 def _adopt_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:
     """Masks that another tool put in their place: looked at, and kept as they are."""
     masks = [read_mask(path, (frames.width, frames.height)) for path in mask_paths(processed, frames)]
@@ -265,17 +277,6 @@ def _adopt_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcom
     write_json(processed / MASKS_FILE, {"notes": notes}, "")
     _draw_masks(picture, processed, frames, masks)
     return StepOutcome("masks", "supplied", "as they are", notes, picture)
-
-
-def _kept(
-    name: StepName, state: State, summary: str, picture: Path, notes: tuple[str, ...] = ()
-) -> StepOutcome:
-    """A step that has nothing to do."""
-    shown = picture if picture.exists() else None
-    if state == "supplied":
-        notes = (*notes, "kept as another tool supplied it; remove it, or pass --redo, to have it made")
-        return StepOutcome(name, "supplied", summary, notes, shown)
-    return StepOutcome(name, "up to date", summary, notes, shown)
 
 
 def _frame_identity(frames: FrameSet) -> dict[str, object]:
@@ -289,10 +290,6 @@ def _frame_identity(frames: FrameSet) -> dict[str, object]:
 
 def _model_identity(request: PreprocessRequest) -> Path | str:
     return "built-in" if request.hand_model is None else request.hand_model
-
-
-def _stored_notes(file: Path) -> tuple[str, ...]:
-    return tuple(str(note) for note in json.loads(file.read_text(encoding="utf-8")).get("notes", ()))
 
 
 def _frames_summary(frames: FrameSet) -> str:

@@ -278,6 +278,20 @@ def read_alignment(path: Path, frames: int) -> Alignment:
     )
 
 
+def read_notes(file: Path) -> tuple[str, ...]:
+    """The `notes` of a report in JSON, none where there is no such file.
+
+    Raises:
+        InputError: damaged, or its notes are no list.
+    """
+    if not file.exists():
+        return ()
+    notes = _read_json(file).get("notes", [])
+    if not isinstance(notes, list):
+        raise InputError(f"{file}: notes: expected a list of sentences, found {type(notes).__name__}")
+    return tuple(map(str, notes))
+
+
 def write_npz(path: Path, arrays: Mapping[str, Any], inputs: str) -> None:
     """Write arrays with their stamp; the file is whole or absent."""
     with atomic_write(path) as file:

@@ -31,12 +31,11 @@ class HandFitConfig:
     exchanges: int = 3
     steps: int = 300
     rate: float = 0.03
-    # Typical second differences over time of joints and of finger angles.
+    # Typical second differences over time of joints (of a hand of mean size) and of finger angles.
     joint_acceleration: float = 0.003
     angle_acceleration: float = 0.08
-    # Shape is held to the mean as if every clip had been seen so many times over: errors of the poses are
-    # alike in
-    # all frames, so many frames say little more of the shape than few.
+    # Errors of the poses are alike in all frames, so many frames say little more of the shape than few: the
+    # pull to the mean shape counts so many times.
     shape_weight: float = 10.0
     # How far joints move from frame to frame, which chooses among candidates.
     reach: float = 0.008
