@@ -45,7 +45,7 @@ def until(
     page: Any,
     condition: Callable[[np.ndarray], bool],
     clip: dict[str, int] | None = None,
-    patience: float = 20.0,
+    patience: float = 60.0,
 ) -> np.ndarray:
     """The first picture of which `condition` holds."""
     end = time.monotonic() + patience
