@@ -37,7 +37,6 @@ _PAPER: dict[frozenset[str], tuple[float, ...]] = {
     frozenset(INGREDIENTS[:3]): (96.55, 117.72, 1.36, 81.78, 27.01, 24.42),
     frozenset(INGREDIENTS): (96.56, 117.72, 1.36, 81.78, 27.22, 25.08),
 }
-NO_PRIOR = "off: no diffusion prior in this version"
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class Row:
 
     @property
     def paper(self) -> tuple[float, ...] | None:
-        """The paper's scores of this variant, if it has them; what this version has not is always off."""
-        return _PAPER.get(frozenset(self.off) | _missing())
+        """The paper's scores of this variant, if it has them."""
+        return _PAPER.get(frozenset(self.off))
 
 
 @dataclass(frozen=True)
@@ -65,15 +64,10 @@ class Ablation:
     failed: list[str]
 
 
-def _missing() -> frozenset[str]:
-    """Ingredients of the paper that there are not."""
-    return frozenset(INGREDIENTS) - set(SWITCHES)
-
-
 def default_rows() -> list[str]:
     """Each of the paper's ingredients missing alone, and as the paper's table takes them away."""
-    there = [name for name in INGREDIENTS if name not in _missing()]
-    return list(dict.fromkeys([*there, *("+".join(there[: n + 1]) for n in range(len(there)))]))
+    joined = ["+".join(INGREDIENTS[: n + 1]) for n in range(len(INGREDIENTS))]
+    return list(dict.fromkeys([*INGREDIENTS, *joined]))
 
 
 def parse_rows(names: Iterable[str]) -> list[Row]:
@@ -87,8 +81,6 @@ def parse_rows(names: Iterable[str]) -> list[Row]:
     for name in chain.from_iterable(name.split(",") for name in names):
         off = tuple(dict.fromkeys(name.split("+"))) if name != FULL else ()
         for what in off:
-            if what in _missing():
-                raise InputError(f"--rows {name}: expected what this version has, found {what!r}")
             if what not in SWITCHES:
                 known = ", ".join((FULL, *SWITCHES))
                 raise InputError(f"--rows {name}: expected names out of {known}, found {what!r}")
@@ -151,11 +143,9 @@ def ablation_table(rows: list[Row], done: dict[str, FinishedRun], unused: dict[s
     body: list[tuple[str, ...]] = []
     notes = [
         "The datasets differ: the paper's figures are means over nine clips of ARCTIC, ours of this clip; "
-        "only the direction of a change compares. CD is squared, as in the paper."
+        "only the direction of a change compares. CD is squared, as in the paper. The paper's prior is "
+        "diffusion; ours is symmetry where no weights are given."
     ]
-    if "prior" in _missing():
-        body += [("with prior: off", *nothing), _paper_cells(_PAPER[frozenset()])]
-        notes.append(f"with prior: {NO_PRIOR}.")
     for row in rows:
         label = " + ".join(row.off) or "nothing"
         run = done.get(row.name)

@@ -38,10 +38,7 @@ def describe_clip(path: Path, hand_model: Path | None = None) -> list[tuple[str,
             continue
         shown = areas > 0
         share = 100.0 * areas[shown].mean() / (clip.width * clip.height) if shown.any() else 0.0
-        text = (
-            f"visible in {int(shown.sum())} frames, {share:.1f} % of the image, " if clip.mask_paths else ""
-        )
-        text += f"{'annotated' if clip.annotated else 'estimated'} in {int(valid.sum())}"
+        text = f"{'annotated' if clip.annotated else 'estimated'} in {int(valid.sum())}"
         if clip.mask_paths:
             text = f"visible in {int(shown.sum())} frames, {share:.1f} % of the image, {text}"
         if entity == "object" and clip.object:

