@@ -51,7 +51,8 @@ def address(finished_run: Run, tiny_clip: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def page(address: str) -> Iterator[Any]:
     with open_page() as page:
-        page.goto(address)
+        # Otherwise the page lowers its resolution when it finds the machine slow.
+        page.goto(f"{address}/?fixedDpr=1")
         page.get_by_text("frames a second").wait_for(timeout=30_000)
         page.wait_for_function("document.querySelector('canvas') !== null")
         until(page, lambda image: (image.sum(-1) < 600).sum() > 1500, SCENE)
@@ -160,14 +161,14 @@ def test_play_and_pause(page: Any, start: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     ("folder", "knob"),
-    [("Pose right hand", "right hand: index"), ("Pose object", "object: turn about x")],
+    [("Pose right hand", "right hand: thumb"), ("Pose object", "object: turn about x")],
 )
 def test_fingers_bend_and_the_object_turns(page: Any, start: np.ndarray, folder: str, knob: str) -> None:
     page.get_by_text(folder, exact=True).click()
     page.get_by_text(knob, exact=True).scroll_into_view_if_needed()
     page.wait_for_timeout(400)  # the folder unfolds
     slide(page, knob, 0.9)
-    until(page, unlike(start, 50), SCENE)
+    until(page, unlike(start, 20), SCENE)
     bent = at_rest(page)
     # The other subjects are where they were.
     assert changed(bent, start) < 0.7 * (start.sum(-1) < 720).sum()
