@@ -41,20 +41,22 @@ class Lighting(nn.Module):
         return light(gaussians, self.clip, self.shade[entity][frames], weights)
 
 
-def light(gaussians: Gaussians, clip: Tensor, shade: Tensor, weights: Tensor) -> Gaussians:
+def light(gaussians: Gaussians, clip: Tensor, shade: Tensor, weights: Tensor | None = None) -> Gaussians:
     """Multiply albedos [N, 3] by the light on each Gaussian's third axis, its outward normal in camera space.
 
     Args:
         gaussians: quats [B, N, 4].
         clip: [8, 3] coefficients of `quadratic_basis` for the whole clip.
         shade: [B, 4 + J] a constant, a slope, and a constant for each of J parts, for each frame.
-        weights: [N, J] how far a Gaussian belongs to each part.
+        weights: [N, J] how far a Gaussian belongs to each part; None where there are none.
 
     Returns:
         The Gaussians with colours [B, N, 3].
     """
     normals = third_axis(gaussians.quats)
-    shaded = shade[:, None, :1] + normals @ shade[:, 1:4, None] + weights @ shade[:, 4:, None]
+    shaded = shade[:, None, :1] + normals @ shade[:, 1:4, None]
+    if weights is not None:
+        shaded = shaded + weights @ shade[:, 4:, None]
     return gaussians._replace(colors=gaussians.colors * torch.exp(quadratic_basis(normals) @ clip + shaded))
 
 

@@ -8,7 +8,6 @@ from bigs.models.lighting import Lighting, light, quadratic_basis, third_axis
 from bigs.types import Gaussians
 
 B, N = 3, 8
-NO_PARTS = torch.zeros(N, 0)
 
 
 def gaussians(dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -30,7 +29,7 @@ def test_third_axis_is_the_rotations_third_column() -> None:
 
 def test_without_coefficients_colours_are_the_albedo() -> None:
     given = gaussians()
-    lit = light(given, torch.zeros(8, 3), torch.zeros(B, 4), NO_PARTS)
+    lit = light(given, torch.zeros(8, 3), torch.zeros(B, 4))
     assert torch.equal(lit.colors, given.colors.expand(B, N, 3))
     for name in ("means", "quats", "scales", "opacities"):
         assert getattr(lit, name) is getattr(given, name)
@@ -48,9 +47,7 @@ def test_light_by_hand() -> None:
     clip[1, 0], clip[2, 1], clip[7, 2] = 0.3, 0.4, 0.1  # red by y, green by z, blue by 3 z^2 - 1
     shade = torch.tensor([[0.2, 0.0, 0.5, 0.0], [0.0, 9.0, 9.0, -0.7]])
     exponents = torch.tensor([[0.3, 0.0, -0.1], [0.0, -0.4, 0.2]]) + torch.tensor([[0.7], [0.7]])
-    torch.testing.assert_close(
-        light(given, clip, shade, torch.zeros(1, 0)).colors[:, 0], 0.5 * exponents.exp()
-    )
+    torch.testing.assert_close(light(given, clip, shade).colors[:, 0], 0.5 * exponents.exp())
 
 
 def test_parts_have_a_shade_of_their_own() -> None:
@@ -77,7 +74,7 @@ def test_light_is_positive_and_keeps_black_black() -> None:
     assert (lit.colors > 0).all() and lit.colors.isfinite().all()
     assert lit.colors.std() > 0.1
     black = given._replace(colors=torch.zeros(N, 3))
-    assert not light(black, torch.ones(8, 3), torch.ones(B, 4), NO_PARTS).colors.any()
+    assert not light(black, torch.ones(8, 3), torch.ones(B, 4)).colors.any()
 
 
 def test_the_basis_has_no_constant_and_is_orthogonal_over_the_sphere() -> None:
