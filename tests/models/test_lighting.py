@@ -68,9 +68,7 @@ def test_parts_have_a_shade_of_their_own() -> None:
 def test_light_is_positive_and_keeps_black_black() -> None:
     given = gaussians()
     generator = torch.Generator().manual_seed(2)
-    lit = light(
-        given, 5.0 * torch.randn(8, 3, generator=generator), torch.randn(B, 4, generator=generator), NO_PARTS
-    )
+    lit = light(given, 5.0 * torch.randn(8, 3, generator=generator), torch.randn(B, 4, generator=generator))
     assert (lit.colors > 0).all() and lit.colors.isfinite().all()
     assert lit.colors.std() > 0.1
     black = given._replace(colors=torch.zeros(N, 3))
