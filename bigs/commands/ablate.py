@@ -19,7 +19,7 @@ from bigs.commands.truth import find_ground_truth, load_truth
 from bigs.hand import load_hand_models
 from bigs.metrics.report import METRICS
 from bigs.train.config import RunConfig
-from bigs.train.fit import check_plan
+from bigs.train.plan import check_plan
 from bigs.train.switches import SWITCHES, without_all
 
 PAGE = "ablation.md"

@@ -27,8 +27,8 @@ from bigs.data.ground_truth import load_ground_truth
 from bigs.hand import load_hand_models
 from bigs.train.config import RunConfig
 from bigs.train.config_file import to_plain
-from bigs.train.fit import check_plan
 from bigs.train.length import planned_steps, shortened
+from bigs.train.plan import check_plan
 from bigs.train.presets import PRESETS
 from bigs.train.switches import without_all
 

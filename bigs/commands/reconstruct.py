@@ -36,8 +36,9 @@ from bigs.models.playback import record
 from bigs.train.checkpoint import FILE_NAME
 from bigs.train.config import RunConfig
 from bigs.train.config_file import save_config
-from bigs.train.fit import FitReport, check_plan, fit
+from bigs.train.fit import FitReport, fit
 from bigs.train.initial import initial_trajectory
+from bigs.train.plan import check_plan
 
 
 @dataclass(frozen=True)

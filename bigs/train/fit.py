@@ -10,18 +10,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 import bigs
-from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_detail import free_hand
-from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
@@ -36,20 +32,13 @@ from bigs.train.config import (
     SplitStage,
     Stage,
 )
+from bigs.train.evidence import EvidenceSource
 from bigs.train.grasps import find_grasps
 from bigs.train.guided_scene import guide_scene
-from bigs.train.initial import touching_frames
 from bigs.train.loop import StageProgress, StageState, run_stage
-from bigs.train.optim import GROUPS
 from bigs.train.scale_search import search_object_scale
 from bigs.train.switches import without
-from bigs.train.targets import Targets, crop_box, load_targets
-from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence, labels
-from bigs.train.terms import Step as LossStep
 from bigs.types import Side
-
-# Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
-SILHOUETTE_SIGMA = 0.0022
 
 
 @dataclass
@@ -122,7 +111,7 @@ def fit(
         report = _continued(FitReport(**position.report), report)
     elif network_note:
         listen({"event": "note", "stage": "start values", "text": network_note})
-    sources = _EvidenceSource(clip, unknown, scene, config, perceptual)
+    sources = EvidenceSource(clip, unknown, scene, config, perceptual)
 
     def keep(index: int, state: StageState | None) -> None:
         """Save what has been reached; of the stage that runs or has just ended."""
@@ -202,7 +191,7 @@ def _optimise(
     scene: Scene,
     stage: OptimizeStage,
     index: int,
-    sources: _EvidenceSource,
+    sources: EvidenceSource,
     config: RunConfig,
     resume: dict[str, Any] | None,
     keep: Callable[[int, StageState | None], None],
@@ -301,140 +290,3 @@ def run_digest(clip: Clip, scene: Scene, config: RunConfig, perceptual: VggWeigh
     for values in (*scene.parameters(), *scene.buffers(), *network):
         digest.update(values.detach().numpy().tobytes())
     return digest.hexdigest()[:16]
-
-
-class _EvidenceSource:
-    """Makes each stage's evidence; what several stages share is made once, when first asked for."""
-
-    def __init__(
-        self,
-        clip: Clip,
-        unknown: np.ndarray,
-        scene: Scene,
-        config: RunConfig,
-        perceptual: VggWeights | None,
-    ) -> None:
-        self.clip = clip
-        self.unknown = unknown
-        self.scene = scene
-        self.config = config
-        self.perceptual = perceptual
-        self.box = crop_box(clip)
-        self.touching: dict[Side, Tensor] = {
-            side: torch.as_tensor(touching_frames(clip, side), dtype=torch.float32)
-            if scene.object_splats is not None
-            else torch.zeros(len(clip))
-            for side in scene.sides
-        }
-        self._targets: dict[int, Targets] = {}
-
-    def evidence(self, stage: Stage) -> Evidence:
-        targets = self.targets(stage.image_size)
-        silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
-        return Evidence(
-            targets, self.touching, silhouettes, self.config.contact, self.config.raster, self.perceptual
-        )
-
-    def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:
-        """The label term of the scene as it is, over some frames: which subject hides which."""
-        evidence = self.evidence(stage)
-        frames = torch.linspace(0, len(self.clip) - 1, min(stage.frames, len(self.clip))).round().long()
-        entities = self.scene.entities
-        with torch.no_grad():
-            canonical = self.scene.canonical(entities)
-        return lambda: float(labels(LossStep(self.scene, evidence, entities, canonical, frames)))
-
-    def targets(self, size: int) -> Targets:
-        if size not in self._targets:
-            long_side = max(self.clip.width, self.clip.height)
-            scale = min(1.0, size / long_side) if size else 1.0
-            # One resolution at a time: a stage that returns to an earlier one is rare, memory is not.
-            self._targets = {size: load_targets(self.clip, self.unknown, scale, self.box)}
-        return self._targets[size]
-
-    def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
-        """A hand whose outline lies right at this resolution.
-
-        The rasteriser widens every Gaussian by eps2d square pixels, so the coarser the image, the further in
-        the centres must go.
-        """
-        model = self.scene.hand_model(side)
-        depth = self.scene.hand_poses[side].position.base_log_depth.exp().median()
-        pixel = float(depth / targets.K[0, 0])
-        spread = (SILHOUETTE_SIGMA**2 + self.config.raster.eps2d * pixel**2) ** 0.5
-        return silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread)
-
-
-# Centres go in by this many standard deviations of a Gaussian as it appears in the image. Opaque neighbours
-# overlap, so their common alpha falls to one half well outside the centres.
-INSET = 1.85
-
-
-def check_plan(config: RunConfig) -> None:
-    """Refuse a configuration that cannot run, before anything is computed or written.
-
-    Raises:
-        InputError: no stage, two of one name, an unknown group or term, or a number out of range.
-    """
-    names = [stage.name for stage in config.stages]
-    if not names:
-        raise InputError("config stages: expected at least one stage, found none")
-    repeated = {name for name in names if names.count(name) > 1}
-    if repeated:
-        raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
-    least = {
-        "checkpoint_every": (config.checkpoint_every, 1),
-        "initial.surface_resolution": (config.initial.surface_resolution, 8),
-        "initial.surface_agreeing": (config.initial.surface_agreeing, 1),
-        "object.n_gaussians": (config.object.n_gaussians, 10),
-        "hand.subdivisions": (config.hand.subdivisions, 0),
-        "raster.eps2d": (config.raster.eps2d, 0.0),
-    }
-    for stage in config.stages:
-        where = f"stages.{stage.name}"
-        if isinstance(stage, ScaleSearchStage):
-            least[f"{where}.candidates"] = (stage.candidates, 1)
-            least[f"{where}.image_size"] = (stage.image_size, 0)
-            least[f"{where}.frames"] = (stage.frames, 1)
-            continue
-        if isinstance(stage, GraspStage):
-            least[f"{where}.speed"] = (stage.speed, 0.0)
-            least[f"{where}.least"] = (stage.least, 2)
-            least[f"{where}.slack"] = (stage.slack, 0.0)
-            least[f"{where}.bridge"] = (stage.bridge, 0)
-            least[f"{where}.longest_move"] = (stage.longest_move, 0)
-            continue
-        if isinstance(stage, GuidanceStage):
-            least[f"{where}.steps"] = (stage.steps, 0)
-            least[f"{where}.views"] = (stage.views, 1)
-            least[f"{where}.image_size"] = (stage.image_size, 16)
-            least[f"{where}.damage"] = (stage.damage, 0.0)
-            continue
-        if isinstance(stage, SplitStage):
-            least[f"{where}.parts"] = (stage.parts, 1)
-            least[f"{where}.least_opacity"] = (stage.least_opacity, 0.0)
-            continue
-        least |= {
-            f"{where}.steps": (stage.steps, 0),
-            f"{where}.image_size": (stage.image_size, 0),
-            f"{where}.frames_per_step": (stage.frames_per_step, 0),
-        }
-        accepted = (*IMAGE_TERMS[stage.step], *TERMS)
-        for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
-            for name in given:
-                if name not in known:
-                    raise InputError(
-                        f"config {where}: expected {kind} out of {', '.join(known)}, found {name!r}"
-                    )
-    for path, (value, lowest) in least.items():
-        if value < lowest:
-            raise InputError(f"config {path}: expected {lowest} or more, found {value}")
-    if config.raster.tile_size not in TILE_SIZES:
-        raise InputError(
-            f"config raster.tile_size: expected {TILE_SIZES[0]}, {TILE_SIZES[1]} or {TILE_SIZES[2]}, "
-            f"found {config.raster.tile_size}"
-        )
-
-
-# What the renderer is compiled for.
-TILE_SIZES = (4, 8, 16)

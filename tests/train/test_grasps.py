@@ -13,8 +13,8 @@ from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, 
 from bigs.hand import mirror_rotation, procedural_hand
 from bigs.models.scene import Scene
 from bigs.train.config import GraspStage, RunConfig
-from bigs.train.fit import check_plan
 from bigs.train.grasps import carried_errors, find_grasps, still_frames, turned_between
+from bigs.train.plan import check_plan
 
 STAGE = GraspStage()
 FRAMES = 24

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bigs.train.config import OptimizeStage, RunConfig
-from bigs.train.fit import check_plan
 from bigs.train.optim import GROUPS
+from bigs.train.plan import check_plan
 from bigs.train.presets import PRESETS
 from bigs.train.terms import IMAGE_TERMS, TERMS
 

@@ -10,7 +10,7 @@ import pytest
 from bigs.checks import InputError
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage
-from bigs.train.fit import check_plan
+from bigs.train.plan import check_plan
 from bigs.train.presets import PRESETS
 from bigs.train.switches import SWITCHES, without, without_all
 from bigs.train.terms import IMAGE_TERMS, TERMS

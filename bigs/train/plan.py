@@ -1,0 +1,78 @@
+"""Whether a configuration can run at all, told before anything is computed or written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from bigs.checks import InputError
+from bigs.train.config import (
+    GraspStage,
+    GuidanceStage,
+    OptimizeStage,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+)
+from bigs.train.optim import GROUPS
+from bigs.train.terms import IMAGE_TERMS, TERMS
+
+# The least value of every number that has one, by its path in the configuration, or in a kind of stage.
+_LEAST = {
+    "checkpoint_every": 1,
+    "initial.surface_resolution": 8,
+    "initial.surface_agreeing": 1,
+    "object.n_gaussians": 10,
+    "hand.subdivisions": 0,
+    "raster.eps2d": 0.0,
+}
+_LEAST_OF_STAGE: Mapping[type, Mapping[str, float]] = {
+    OptimizeStage: {"steps": 0, "image_size": 0, "frames_per_step": 0},
+    ScaleSearchStage: {"candidates": 1, "image_size": 0, "frames": 1},
+    GraspStage: {"speed": 0.0, "least": 2, "slack": 0.0, "bridge": 0, "longest_move": 0},
+    SplitStage: {"parts": 1, "least_opacity": 0.0},
+    GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0},
+}
+# What the renderer is compiled for.
+TILE_SIZES = (4, 8, 16)
+
+
+def check_plan(config: RunConfig) -> None:
+    """Refuse a configuration that cannot run.
+
+    Raises:
+        InputError: no stage, two of one name, an unknown group or term, or a number out of range.
+    """
+    names = [stage.name for stage in config.stages]
+    if not names:
+        raise InputError("config stages: expected at least one stage, found none")
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated:
+        raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
+    _check_numbers("config ", config, _LEAST)
+    for stage in config.stages:
+        where = f"config stages.{stage.name}"
+        _check_numbers(f"{where}.", stage, _LEAST_OF_STAGE[type(stage)])
+        if isinstance(stage, OptimizeStage):
+            _check_names(where, stage)
+    if config.raster.tile_size not in TILE_SIZES:
+        raise InputError(
+            f"config raster.tile_size: expected {TILE_SIZES[0]}, {TILE_SIZES[1]} or {TILE_SIZES[2]}, "
+            f"found {config.raster.tile_size}"
+        )
+
+
+def _check_names(where: str, stage: OptimizeStage) -> None:
+    accepted = (*IMAGE_TERMS[stage.step], *TERMS)
+    for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
+        for name in given:
+            if name not in known:
+                raise InputError(f"{where}: expected {kind} out of {', '.join(known)}, found {name!r}")
+
+
+def _check_numbers(where: str, owner: object, least: Mapping[str, float]) -> None:
+    for path, lowest in least.items():
+        value = owner
+        for name in path.split("."):
+            value = getattr(value, name)
+        if value < lowest:
+            raise InputError(f"{where}{path}: expected {lowest} or more, found {value}")
