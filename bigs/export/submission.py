@@ -117,6 +117,7 @@ def _check_archive(where: str, buffer: io.BytesIO, sequences: Sequence[str]) -> 
 def _member(archive: zipfile.ZipFile, where: str, info: zipfile.ZipInfo) -> bytes:
     try:
         return archive.read(info)
+    # zipfile says RuntimeError of an encrypted member, NotImplementedError of a compression it does not know.
     except (zipfile.BadZipFile, OSError, EOFError, RuntimeError, NotImplementedError) as error:
         raise InputError(
             f"{where}: {info.filename}: expected a whole file, found a damaged one ({error})"

@@ -76,6 +76,7 @@ def test_holds_class_is_what_its_evaluator_finds(
     monkeypatch.setitem(sys.modules, "common.xdict", module)
     with zipfile.ZipFile(archive) as stored:
         content = stored.read(f"arctic_preds/{NAMES[1]}.pt")
+    # As the evaluator opens it; the bytes are those that this test has just written.
     opened = torch.load(io.BytesIO(content), weights_only=False)
     assert type(opened) is xdict
     expected = torch.load(predictions[1], weights_only=True)
