@@ -7,6 +7,9 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # What the tests use beside it: every optional part, so that none is skipped.
 ALL_EXTRAS := dev,synthetic,video,bench,diffusion,segment,viewer,export,rerun,slurm,ray,browser
 
+# Processes that share the tests; each works on one thread.
+TEST_WORKERS ?= 2
+
 .PHONY: setup setup-all demo test lint test-rust test-python bench wheel clean
 
 setup: $(BIN)/bigs
@@ -41,7 +44,7 @@ test-rust:
 	cargo test --quiet -p bigs-raster
 
 test-python:
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist worksteal
 
 bench: setup
 	cargo bench -p bigs-raster

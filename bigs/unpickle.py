@@ -1,18 +1,15 @@
 """Reading other people's pickles without running anything they ask for.
 
-A pickle is a program that may name any function. Here every name is checked against a short list, and even
-a name on the list is not what gets called: while the program runs, each call only makes an inert record of
-what was asked for. The records are turned into arrays, sparse matrices and tensors afterwards, by the code
-below, which checks types, sizes and indices. (Handing a pickle the real `numpy.dtype` is not safe: a forged
-dtype state lets raw bytes pass for object pointers.)
+A pickle is a program that may name any function. `bigs.pickle_records` runs it with every call replaced by an
+inert record of what was asked for. Here the records become arrays, sparse matrices and tensors, by code that
+checks types, sizes and indices. (Handing a pickle the real `numpy.dtype` is not safe: a forged dtype state
+lets raw bytes pass for object pointers.)
 """
 
 from __future__ import annotations
 
 import io
 import math
-import pickle
-import pickletools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -23,51 +20,18 @@ import scipy.sparse
 import torch
 
 from bigs.checks import InputError
-
-Global = tuple[str, str]
-
-# The names a pickle may use, as canonical (module, qualified name) pairs; see `_canonical`.
-CONTAINERS: frozenset[Global] = frozenset(
-    {
-        ("builtins", "set"),
-        ("builtins", "frozenset"),
-        ("builtins", "object"),
-        ("builtins", "bytes"),
-        ("collections", "OrderedDict"),
-        ("copyreg", "_reconstructor"),
-        ("_codecs", "encode"),
-    }
+from bigs.pickle_records import (
+    ARRAYS,
+    CHUMPY,
+    SPARSE,
+    STORAGE_DTYPES,
+    TENSORS,
+    Global,
+    PersistentId,
+    Record,
+    Refused,
+    load_records,
 )
-ARRAYS: frozenset[Global] = CONTAINERS | {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy.core.numeric", "_frombuffer"),
-}
-SPARSE: frozenset[Global] = ARRAYS | {
-    (f"scipy.sparse.{kind}", f"{kind}_{form}") for kind in ("csc", "csr") for form in ("matrix", "array")
-}
-CHUMPY: frozenset[Global] = SPARSE | {("chumpy.ch", "Ch"), ("chumpy.reordering", "Select")}
-
-STORAGE_DTYPES: dict[str, np.dtype] = {
-    "DoubleStorage": np.dtype("<f8"),
-    "FloatStorage": np.dtype("<f4"),
-    "HalfStorage": np.dtype("<f2"),
-    "LongStorage": np.dtype("<i8"),
-    "IntStorage": np.dtype("<i4"),
-    "ShortStorage": np.dtype("<i2"),
-    "CharStorage": np.dtype("i1"),
-    "ByteStorage": np.dtype("u1"),
-    "BoolStorage": np.dtype("?"),
-}
-TENSORS: frozenset[Global] = ARRAYS | {
-    ("torch", "Size"),
-    ("torch._utils", "_rebuild_tensor"),
-    ("torch._utils", "_rebuild_tensor_v2"),
-    ("torch.storage", "_load_from_bytes"),
-    *(("torch", storage) for storage in STORAGE_DTYPES),
-}
 
 _DTYPE_CODE = re.compile(r"[<>|=]?(b1|\?|[iu][1248]|f[248]|c8|c16|S\d+|U\d+|O[48]?)")
 _TORCH_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -91,8 +55,8 @@ def restricted_load(file: BinaryIO, *, name: str, allow: frozenset[Global] = ARR
         InputError: the pickle names anything else, or is damaged.
     """
     try:
-        return _Builder(allow).value(_load_records(io.BytesIO(file.read()), allow))
-    except _Refused as refusal:
+        return _Builder(allow).value(load_records(io.BytesIO(file.read()), allow))
+    except Refused as refusal:
         raise InputError(
             f"{name}: expected a pickle of plain data, found the global '{refusal}', which is refused "
             "because it could run code"
@@ -136,92 +100,6 @@ def _npy_dtype(file: BinaryIO) -> np.dtype:
     return readers[version](file)[2]
 
 
-class _Refused(pickle.UnpicklingError):
-    """A global that is not on the list; the message is its name."""
-
-
-class _Record:
-    """An object as a pickle describes it: a name, arguments, and a state. Never has any behaviour."""
-
-    __slots__ = ("args", "state")
-    key: Global = ("", "")
-
-    args: tuple[Any, ...]
-    state: Any
-
-    def __new__(cls, *args: Any) -> _Record:
-        record = object.__new__(cls)
-        record.args = args
-        record.state = None
-        return record
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-
-class _PersistentId(_Record):
-    """A reference to data outside the pickle (used by torch)."""
-
-    __slots__ = ()
-    key = ("", "persistent id")
-
-
-class _DictRecord(_Record):
-    """An ordered dict; the only record that items are stored into."""
-
-    __slots__ = ("entries",)
-    entries: dict[Any, Any]
-
-    def __setitem__(self, key: Any, item: Any) -> None:
-        if not hasattr(self, "entries"):
-            self.entries = {}
-        self.entries[key] = item
-
-
-class _RecordingUnpickler(pickle.Unpickler):
-    """Runs a pickle's program with every global replaced by a record class made for this one load."""
-
-    def __init__(self, file: BinaryIO, allow: frozenset[Global], *, persistent: bool = False) -> None:
-        super().__init__(file, encoding="latin1")
-        self._allow = allow
-        self._persistent = persistent
-        self._classes: dict[Global, type[_Record]] = {}
-
-    def find_class(self, module: str, name: str) -> type[_Record]:
-        key = _canonical(module, name)
-        if key not in self._allow:
-            raise _Refused(f"{module}.{name}")
-        if key not in self._classes:
-            base = _DictRecord if key == ("collections", "OrderedDict") else _Record
-            self._classes[key] = type(name, (base,), {"__slots__": (), "key": key})
-        return self._classes[key]
-
-    def persistent_load(self, pid: Any) -> _Record:
-        if not self._persistent:
-            raise pickle.UnpicklingError("a reference to data outside the pickle")
-        return _PersistentId(pid)
-
-
-def _load_records(stream: io.BytesIO, allow: frozenset[Global], *, persistent: bool = False) -> Any:
-    """The next pickle in `stream` with every global call left as a record."""
-    start = stream.tell()
-    # A few forged bytes can make the unpickler allocate gigabytes: a length beyond the end of the data (which
-    # this walk over the program notices by itself), or a memo slot that no program of this size would reach.
-    for count, (opcode, argument, _position) in enumerate(pickletools.genops(stream)):
-        if opcode.name.endswith("PUT") and int(argument or 0) > count:
-            raise ValueError(f"memo slot {argument} after {count} instructions")
-    stream.seek(start)
-    return _RecordingUnpickler(stream, allow, persistent=persistent).load()
-
-
-def _canonical(module: str, name: str) -> Global:
-    """One spelling for a global that Python 2, NumPy 1 and 2, and old and new SciPy spell differently."""
-    module = {"__builtin__": "builtins", "copy_reg": "copyreg", "chumpy": "chumpy.ch"}.get(module, module)
-    module = re.sub(r"^numpy\._core\b", "numpy.core", module)
-    module = re.sub(r"^scipy\.sparse\._(csc|csr)$", r"scipy.sparse.\1", module)
-    return module, name
-
-
 class _Builder:
     """Turns records into values, depth first. Shared parts stay shared; a cycle is an error."""
 
@@ -241,7 +119,7 @@ class _Builder:
             raise ValueError("an object that contains itself")
         self._active.add(id(raw))
         self._alive.append(raw)
-        result = self._record(raw) if isinstance(raw, _Record) else self._container(raw)
+        result = self._record(raw) if isinstance(raw, Record) else self._container(raw)
         self._active.discard(id(raw))
         self._done[id(raw)] = result
         return result
@@ -253,13 +131,13 @@ class _Builder:
             return type(raw)([self.value(item) for item in raw])
         if type(raw) is bytearray:
             return bytes(raw)
-        what = ".".join(raw.key) if isinstance(raw, type) and issubclass(raw, _Record) else type(raw).__name__
+        what = ".".join(raw.key) if isinstance(raw, type) and issubclass(raw, Record) else type(raw).__name__
         raise TypeError(f"{what} where data should be")
 
-    def _record(self, record: _Record) -> Any:
+    def _record(self, record: Record) -> Any:
         if record.key == ("copyreg", "_reconstructor"):
             state, (cls, *_) = record.state, record.args
-            if not (isinstance(cls, type) and issubclass(cls, _Record)):
+            if not (isinstance(cls, type) and issubclass(cls, Record)):
                 raise TypeError("copyreg._reconstructor of something that is not a class")
             record = cls()
             record.state = state
@@ -280,12 +158,12 @@ class _Builder:
     def storage(self, raw: bytes) -> torch.Tensor:
         """A flat tensor from the stream in which `torch.save` wrote one storage before it used zip files."""
         stream = io.BytesIO(raw)
-        magic, version, system = (_load_records(stream, frozenset()) for _ in range(3))
+        magic, version, system = (load_records(stream, frozenset()) for _ in range(3))
         if magic != _TORCH_LEGACY_MAGIC or version != 1001 or system.get("little_endian") is not True:
             raise ValueError("a torch storage of an unknown format")
-        reference = _load_records(stream, self._allow, persistent=True)
-        keys = _load_records(stream, frozenset())
-        if type(reference) is not _PersistentId:
+        reference = load_records(stream, self._allow, persistent=True)
+        keys = load_records(stream, frozenset())
+        if type(reference) is not PersistentId:
             raise TypeError("a torch storage that is not a storage")
         kind, storage_type, key, _location, count, *view = reference.args[0]
         if kind != "storage" or keys != [key] or any(part is not None for part in view):
@@ -307,7 +185,7 @@ def _shape(value: Any) -> tuple[int, ...]:
     return tuple(int(n) for n in value)
 
 
-def _build_dtype(builder: _Builder, record: _Record) -> np.dtype:
+def _build_dtype(builder: _Builder, record: Record) -> np.dtype:
     code = record.args[0]
     state = builder.value(record.state) or (3, "|", None, None, None)
     if (
@@ -320,9 +198,9 @@ def _build_dtype(builder: _Builder, record: _Record) -> np.dtype:
     return dtype.newbyteorder(">") if state[1] == ">" else dtype
 
 
-def _build_array(builder: _Builder, record: _Record) -> np.ndarray:
+def _build_array(builder: _Builder, record: Record) -> np.ndarray:
     cls = record.args[0]
-    if not (isinstance(cls, type) and issubclass(cls, _Record) and cls.key == ("numpy", "ndarray")):
+    if not (isinstance(cls, type) and issubclass(cls, Record) and cls.key == ("numpy", "ndarray")):
         raise TypeError("an array that is not a plain numpy.ndarray")
     _version, raw_shape, raw_dtype, fortran, data = record.state
     shape, dtype = _shape(builder.value(raw_shape)), builder.value(raw_dtype)
@@ -335,19 +213,19 @@ def _build_array(builder: _Builder, record: _Record) -> np.ndarray:
     return np.reshape(array, shape, order="F" if fortran else "C")
 
 
-def _build_array_from_buffer(builder: _Builder, record: _Record) -> np.ndarray:
+def _build_array_from_buffer(builder: _Builder, record: Record) -> np.ndarray:
     data, raw_dtype, raw_shape, order, *axes = record.args
     dtype, shape = builder.value(raw_dtype), _shape(builder.value(raw_shape))
     array = _from_bytes(builder.buffer(data), dtype, shape, order)
     return array.transpose(builder.value(axes[0])) if order == "K" and axes else array
 
 
-def _build_scalar(builder: _Builder, record: _Record) -> Any:
+def _build_scalar(builder: _Builder, record: Record) -> Any:
     dtype, data = builder.value(record.args[0]), builder.buffer(record.args[1])
     return _from_bytes(data, dtype, (), "C")[()]
 
 
-def _build_sparse(builder: _Builder, record: _Record) -> Any:
+def _build_sparse(builder: _Builder, record: Record) -> Any:
     state = builder.value(record.state)
     matrix_type = getattr(scipy.sparse, record.key[1])
     parts = tuple(np.asarray(state[part]) for part in ("data", "indices", "indptr"))
@@ -357,7 +235,7 @@ def _build_sparse(builder: _Builder, record: _Record) -> Any:
     return matrix
 
 
-def _build_chumpy(builder: _Builder, record: _Record) -> np.ndarray:
+def _build_chumpy(builder: _Builder, record: Record) -> np.ndarray:
     """A `Ch` holds its array as `x`; a `Select` takes `idxs` of `a`, flattened, into `preferred_shape`."""
     state = record.state
     if record.key[1] == "Ch":
@@ -367,7 +245,7 @@ def _build_chumpy(builder: _Builder, record: _Record) -> np.ndarray:
     return picked.reshape(builder.value(state["preferred_shape"])) if "preferred_shape" in state else picked
 
 
-def _build_tensor(builder: _Builder, record: _Record) -> torch.Tensor:
+def _build_tensor(builder: _Builder, record: Record) -> torch.Tensor:
     storage, offset, size, stride = (builder.value(part) for part in record.args[:4])
     if not isinstance(storage, torch.Tensor):
         raise TypeError("a torch tensor without a storage")
@@ -378,23 +256,23 @@ def _build_tensor(builder: _Builder, record: _Record) -> torch.Tensor:
     return storage.as_strided(size, stride, offset).clone()
 
 
-def _build_from_iterable(make: type) -> Callable[[_Builder, _Record], Any]:
+def _build_from_iterable(make: type) -> Callable[[_Builder, Record], Any]:
     return lambda builder, record: make(*(builder.value(arg) for arg in record.args[:1]))
 
 
-def _build_dict(builder: _Builder, record: _Record) -> dict[Any, Any]:
+def _build_dict(builder: _Builder, record: Record) -> dict[Any, Any]:
     given = dict(builder.value(record.args[0])) if record.args else {}
     return given | builder.value(getattr(record, "entries", {}))
 
 
-def _build_encoded(builder: _Builder, record: _Record) -> bytes:
+def _build_encoded(builder: _Builder, record: Record) -> bytes:
     """Python 3 writes bytes as `codecs.encode(text, "latin1")` in the protocols that Python 2 can read."""
     if record.args[1:] not in (("latin1",), ("latin-1",)):
         raise ValueError(f"the text encoding {record.args[1:]!r}")
     return builder.value(record.args[0]).encode("latin1")
 
 
-_BUILDERS: dict[Global, Callable[[_Builder, _Record], Any]] = {
+_BUILDERS: dict[Global, Callable[[_Builder, Record], Any]] = {
     ("builtins", "set"): _build_from_iterable(set),
     ("builtins", "frozenset"): _build_from_iterable(frozenset),
     ("builtins", "bytes"): lambda builder, record: builder.buffer(record.args[0]) if record.args else b"",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from command_line import Answer, Run, run_bigs
 from fake_runs import FakeRuns
 
@@ -15,6 +17,13 @@ from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import Side
+
+# Where several processes share the tests (pytest -n), each and what it starts works on one thread, or their
+# threads would wait for each other. Both pools read this when they are first used.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("RAYON_NUM_THREADS", "1")
+    torch.set_num_threads(1)
 
 
 def pytest_configure(config: pytest.Config) -> None:

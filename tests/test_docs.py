@@ -10,7 +10,8 @@ import pytest
 
 from bigs.cli.app import COMMANDS
 
-DOCS = sorted((Path(__file__).parents[1] / "docs").glob("*.md"))
+ROOT = Path(__file__).parents[1]
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NAMED = re.compile(r"`(bigs(?:\.\w+)+)")
 
 

@@ -24,7 +24,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "types": set(),
     "checks": set(),
     "atomic": set(),
-    "unpickle": {"checks"},
+    "pickle_records": set(),
+    "unpickle": {"checks", "pickle_records"},
     "weights": {"checks"},
     "_raster": {"raster"},  # the compiled module's stub names the settings class
     "geometry": BELOW,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from safetensors.numpy import load_file
+from short_plans import short
 
 from bigs.commands.reconstruct import reconstruct
-from bigs.train.config import OptimizeStage, RunConfig
 from bigs.train.presets import SMOKE
 from bigs.types import MASK_VALUES
 from bigs.unpickle import load_npy
 
 pytestmark = pytest.mark.slow
-
-
-def plan() -> RunConfig:
-    """Every stage of the smoke preset, hardly any steps."""
-    stages = tuple(
-        replace(stage, steps=2, image_size=40) if isinstance(stage, OptimizeStage) else stage
-        for stage in copy.deepcopy(SMOKE.stages)
-    )
-    return replace(SMOKE, stages=stages)
 
 
 class OddClip:
@@ -113,7 +102,7 @@ def the_object_is_behind_the_camera_once(clip: OddClip) -> None:
 )
 def test_it_ends_well(tiny_clip: Path, tmp_path: Path, make_odd: Callable[[OddClip], None]) -> None:
     make_odd(OddClip(Path(shutil.copytree(tiny_clip, tmp_path / "clip"))))
-    outcome = reconstruct(tmp_path / "clip", tmp_path / "run", plan())
+    outcome = reconstruct(tmp_path / "clip", tmp_path / "run", short(SMOKE, image_size=40))
     written = load_file(tmp_path / "run" / "scene.safetensors")
     assert all(np.isfinite(values).all() for values in written.values() if values.dtype.kind == "f")
     assert {key.split(".")[0] for key in written} >= {"right", "left", "object"}

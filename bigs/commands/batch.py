@@ -176,10 +176,8 @@ def _summarise(plan: BatchPlan) -> list[tuple[str, ...]]:
         PageRow(
             cells,
             status.state,
-            report=f"{run.folder.name}/{REPORT}" if (run.folder / REPORT).is_file() else None,
-            picture=f"{run.folder.name}/{PREVIEW_PICTURE}"
-            if (run.folder / PREVIEW_PICTURE).is_file()
-            else None,
+            report=_within(run.folder, REPORT),
+            picture=_within(run.folder, PREVIEW_PICTURE),
         )
         for cells, (run, status) in zip(explained[1:], rows, strict=True)
     ]

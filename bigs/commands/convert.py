@@ -74,7 +74,8 @@ def convert(
     if plan.masks is not None:
         masks = list_frames(plan.masks, MASK_SUFFIXES)
         check_pairs(clip.image_paths, masks)
-        areas = decode_frames((), masks, (clip.width, clip.height))
+        size = (clip.width, clip.height) if clip.optics is None else clip.optics.file_size
+        areas = decode_frames((), masks, size)
         clip = replace(clip, mask_paths=masks, mask_areas=areas)
     if not clip.mask_paths:
         raise InputError(f"{source}: expected label masks (--masks), found none")

@@ -10,6 +10,7 @@ import numpy as np
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.images import decode_frames
+from bigs.data.optics import Optics
 from bigs.types import Side
 
 
@@ -47,7 +48,11 @@ class Annotation:
 
 
 def annotated_clip(
-    annotation: Annotation, folder: Path, image_paths: tuple[Path, ...], mask_paths: tuple[Path, ...]
+    annotation: Annotation,
+    folder: Path,
+    image_paths: tuple[Path, ...],
+    mask_paths: tuple[Path, ...],
+    optics: Optics | None = None,
 ) -> Clip:
     """A clip whose tracks are the annotation; the object's points are its mesh's vertices.
 
@@ -56,11 +61,13 @@ def annotated_clip(
         folder: what the clip is called by in messages.
         image_paths: T images.
         mask_paths: T label masks, or none.
+        optics: how the files differ from the annotation's pictures, where they do.
 
     Raises:
-        InputError: an image or a mask is unreadable or has another size than the annotation.
+        InputError: an image or a mask is unreadable or has another size than it should.
     """
-    areas = decode_frames(image_paths, mask_paths, (annotation.width, annotation.height))
+    size = (annotation.width, annotation.height) if optics is None else optics.file_size
+    areas = decode_frames(image_paths, mask_paths, size)
     obj = None
     if annotation.object is not None:
         truth = annotation.object
@@ -93,6 +100,7 @@ def annotated_clip(
         normalize_shift=shift,
         mask_areas=areas,
         annotated=True,
+        optics=optics,
     )
 
 

@@ -18,8 +18,9 @@ from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import array_field, mapping_field, read_json, require
-from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames
+from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import read_mesh
+from bigs.data.optics import Optics
 from bigs.types import SIDES
 from bigs.unpickle import load_npy
 
@@ -29,6 +30,10 @@ MM_PER_M = 1000.0
 # What two hands hold is longer than 2 mm and shorter than 2 m: the template's unit can be told.
 _LONGEST_M = 2.0
 _IMAGE_FOLDERS = ("images", "cropped_images")
+# What the data set's own processing makes of a sequence lies in one of these, from ROOT: it has the boxes.
+_PROCESSED_FOLDERS = ("processed/seqs", "processed_verts/seqs")
+# A cropped image shows so many times the box, whose side is its scale times so many pixels.
+_CROP_FACTOR, _BOX_PIXELS = 1.5, 200.0
 # Ours: label masks may lie here, in the same tree as the images.
 _MASK_FOLDER = "masks"
 
@@ -95,6 +100,8 @@ def find_arctic(path: str | Path) -> ArcticView | None:
 def load_arctic(path: str | Path) -> Clip:
     """A view's images with its annotation as tracks (`annotated` is set), and its masks where there are any.
 
+    Cropped images are put back where they were cut out, and the egocentric view's distortion is undone.
+
     Raises:
         InputError: one sentence naming file, field, expected and found.
     """
@@ -103,18 +110,14 @@ def load_arctic(path: str | Path) -> Clip:
         raise InputError(f"{path}: expected a folder with raw_seqs/ and meta/ of ARCTIC, found none")
     folder = view.frames_in("images")
     if not folder.is_dir() and view.frames_in("cropped_images").is_dir():
-        raise InputError(
-            f"{folder}: expected the whole images, found only cropped_images, in which every frame has "
-            "another camera"
-        )
+        folder = view.frames_in("cropped_images")
     image_paths = list_frames(folder, IMAGE_SUFFIXES)
     mask_paths: tuple[Path, ...] = ()
     if view.frames_in(_MASK_FOLDER).is_dir():
         mask_paths = list_frames(view.frames_in(_MASK_FOLDER), MASK_SUFFIXES)
         check_pairs(image_paths, mask_paths)
-    return annotated_clip(
-        read_arctic(view, [file.name for file in image_paths]), folder, image_paths, mask_paths
-    )
+    annotation = read_arctic(view, [file.name for file in image_paths])
+    return annotated_clip(annotation, folder, image_paths, mask_paths, _optics(view, annotation, image_paths))
 
 
 def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
@@ -125,24 +128,20 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
         frame_names: the images' names, whose stems are numbers.
 
     Raises:
-        InputError: a missing or damaged file or field, a name that is no number, no annotated frame, or a
-            distorted camera.
+        InputError: a missing or damaged file or field, a name that is no number, or no annotated frame.
     """
-    meta_file = view.root / "meta" / "misc.json"
-    meta = _subject_meta(meta_file, view.subject)
-    where = f"{meta_file}: {view.subject}"
-    offset = array_field(f"{where}.ioi_offset", require(f"{where}.ioi_offset", meta, "ioi_offset"), ())
+    where, meta = _subject_meta(view)
     sizes = array_field(f"{where}.image_size", require(f"{where}.image_size", meta, "image_size"), (9, 2))
     hands_file = view.raw("mano")
     stored = mapping_field(str(hands_file), load_npy(hands_file))
     where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
     n_rows = len(np.asarray(require(f"{where_hands['right']}.rot", stored.get("right", {}), "rot")))
-    rows = np.array([_frame_number(view, name) for name in frame_names]) - int(offset)
+    rows, offset = _rows(view, frame_names)
     valid = (rows >= 0) & (rows < n_rows)
     if not valid.any():
         raise InputError(
             f"{hands_file}: expected the images {frame_names[0]} to {frame_names[-1]} among its {n_rows} "
-            f"frames from {int(offset)} on, found none"
+            f"frames from {offset} on, found none"
         )
     rows = np.clip(rows, 0, n_rows - 1)
     K, cam_from_world = _camera(view, where, meta, rows)
@@ -162,9 +161,19 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
     )
 
 
-def _subject_meta(file: Path, subject: str) -> Mapping[str, Any]:
+def _subject_meta(view: ArcticView) -> tuple[str, Mapping[str, Any]]:
+    """What misc.json says of the subject, and how messages call that place."""
+    file = view.root / "meta" / "misc.json"
+    where = f"{file}: {view.subject}"
     meta = mapping_field(str(file), read_json(file))
-    return mapping_field(f"{file}: {subject}", require(f"{file}: {subject}", meta, subject))
+    return where, mapping_field(where, require(where, meta, view.subject))
+
+
+def _rows(view: ArcticView, frame_names: Sequence[str]) -> tuple[np.ndarray, int]:
+    """The annotation row of each image [T], which may not exist, and the number of the image of row 0."""
+    where, meta = _subject_meta(view)
+    offset = int(array_field(f"{where}.ioi_offset", require(f"{where}.ioi_offset", meta, "ioi_offset"), ()))
+    return np.array([_frame_number(view, name) for name in frame_names]) - offset, offset
 
 
 def _frame_number(view: ArcticView, name: str) -> int:
@@ -193,15 +202,46 @@ def _egocentric_camera(file: Path, rows: np.ndarray) -> tuple[np.ndarray, np.nda
     def field(key: str, shape: tuple[int | str, ...]) -> np.ndarray:
         return array_field(f"{file}: {key}", require(f"{file}: {key}", stored, key), shape)
 
-    if "dist8" in stored and field("dist8", (8,)).any():
-        raise InputError(
-            f"{file}: dist8: expected a camera without distortion, found one that has it; "
-            "use a view from 1 to 8"
-        )
     cam_from_world = np.repeat(np.eye(4)[None], len(rows), axis=0)
     cam_from_world[:, :3, :3] = field("R_k_cam_np", ("T", 3, 3))[rows]
     cam_from_world[:, :3, 3:] = field("T_k_cam_np", ("T", 3, 1))[rows]
     return field("intrinsics", (3, 3)), cam_from_world
+
+
+def _optics(view: ArcticView, annotation: Annotation, image_paths: Sequence[Path]) -> Optics | None:
+    """How the files differ from the view's pinhole pictures; None where they do not."""
+    height, width = read_image(image_paths[0]).shape[:2]
+    size = (annotation.width, annotation.height)
+    distortion = np.zeros(8)
+    if view.view == 0:
+        file = view.raw("egocam.dist")
+        stored = mapping_field(str(file), load_npy(file))
+        distortion = array_field(f"{file}: dist8", stored.get("dist8", distortion), (8,))
+    is_cropped = image_paths[0].is_relative_to(view.root / "cropped_images")
+    boxes = np.repeat([[0.0, 0.0, *map(float, size)]], len(image_paths), axis=0)
+    if not is_cropped or (width, height) == size:
+        # A picture of another size than annotated is refused where it is read.
+        return Optics(annotation.K, size, size, boxes, distortion) if distortion.any() else None
+    if view.view:  # those of view 0 are whole and only smaller
+        boxes = _crop_boxes(view, [path.name for path in image_paths])
+    return Optics(annotation.K, size, (width, height), boxes, distortion)
+
+
+def _crop_boxes(view: ArcticView, frame_names: Sequence[str]) -> np.ndarray:
+    """What part of the whole picture each cropped image shows, [T, 4] left, top, right, bottom."""
+    places = [view.root / place / view.subject / f"{view.sequence}.npy" for place in _PROCESSED_FOLDERS]
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
+        raise InputError(
+            f"{view.frames_in('images')}: expected the whole images, or in {places[0]} the boxes of the "
+            "cropped ones, found only cropped_images"
+        )
+    stored = mapping_field(str(file), load_npy(file))
+    boxes = array_field(f"{file}: bbox", require(f"{file}: bbox", stored, "bbox"), ("T", 9, 3))
+    rows, _ = _rows(view, frame_names)
+    center_x, center_y, scale = boxes[np.clip(rows, 0, len(boxes) - 1), view.view].T
+    half = 0.5 * _CROP_FACTOR * _BOX_PIXELS * scale
+    return np.stack([center_x - half, center_y - half, center_x + half, center_y + half], axis=-1)
 
 
 def _read_hand(where: str, stored: Any, n_rows: int, rows: np.ndarray, valid: np.ndarray) -> HandTrack:

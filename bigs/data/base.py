@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bigs.data.images import read_image, read_mask
+from bigs.data.optics import Optics
 from bigs.types import Entity, Side
 
 
@@ -65,19 +66,24 @@ class Clip:
     normalize_shift: (
         np.ndarray
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
-    mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the masks; every entity has a key
+    mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files; all have a key
     annotated: bool = False  # the tracks are a dataset's truth, which no reconstruction may start from
+    optics: Optics | None = None  # how the files differ from the pictures, where they do
 
     def __len__(self) -> int:
         return len(self.image_paths)
 
     def image(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB."""
-        return read_image(self.image_paths[t], (self.width, self.height))
+        if self.optics is None:
+            return read_image(self.image_paths[t], (self.width, self.height))
+        return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
 
     def mask(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""
-        return read_mask(self.mask_paths[t], (self.width, self.height))
+        if self.optics is None:
+            return read_mask(self.mask_paths[t], (self.width, self.height))
+        return self.optics.pinhole(t, read_mask(self.mask_paths[t], self.optics.file_size), order=0)
 
     def has_pixels(self, entity: Entity) -> np.ndarray:
         """In which frames the masks show `entity`, [T] bool."""

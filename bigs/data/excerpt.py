@@ -46,5 +46,6 @@ def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
         cam_from_world=clip.cam_from_world[frames],
         hands=hands,
         object=obj,
+        optics=None if clip.optics is None else clip.optics.chosen(frames),
         mask_areas={entity: areas[frames] for entity, areas in clip.mask_areas.items()},
     )

@@ -89,7 +89,13 @@ def decode_frames(
 ) -> dict[Entity, np.ndarray]:
     """Decode everything once, as a check, and count each entity's mask pixels: {entity: [T]}.
 
-    Without masks every count is 0.
+    Args:
+        image_paths: T images, or none to be checked.
+        mask_paths: T label masks, or none, and every count is 0.
+        size: (width, height) that each file must have.
+
+    Raises:
+        InputError: a file is unreadable or has another size.
     """
 
     def check(image: Path) -> None:

@@ -15,7 +15,7 @@ from command_line import Answer, Run, assert_refused
 from PIL import Image
 from small_vgg import lpips_channels, torchvision_state
 
-from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.evaluation import Evaluation, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.paper_tables import beside_paper
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_annotation
@@ -33,6 +33,14 @@ pytestmark = pytest.mark.slow
 def run(tmp_path: Path, finished_run: Run) -> Path:
     shutil.copytree(finished_run.folder, tmp_path / "run")
     return tmp_path / "run"
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory, finished_run: Run) -> Evaluation:
+    """The finished run scored by its own clip, once for all."""
+    copy = tmp_path_factory.mktemp("own") / "run"
+    shutil.copytree(finished_run.folder, copy)
+    return evaluate_run(copy, EvaluationPlan())
 
 
 def columns(file: Path) -> dict[str, np.ndarray]:
@@ -57,25 +65,30 @@ def test_the_runs_own_clip_gives_everything(run: Path, tiny: Clip) -> None:
     assert found.remarks == ("LPIPS is not scored: no weights (--perceptual-weights)",)
 
 
-def test_arctics_layout_is_the_same_truth(run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path) -> None:
+def test_arctics_layout_is_the_same_truth(
+    run: Path, own: Evaluation, tiny: Clip, tiny_clip: Path, tmp_path: Path
+) -> None:
     annotation = load_annotation(tiny_clip)
     images = [tiny.image(t) for t in range(len(tiny))]
     write_arctic(
         tmp_path / "arctic", annotation, subject="s01", sequence="bottle_grab_01", images=images, offset=0
     )
-    own = evaluate_run(run, EvaluationPlan()).scores["result"]
     plan = EvaluationPlan(ground_truth=tmp_path / "arctic" / "s01" / "bottle_grab_01" / "1")
     found = evaluate_run(run, plan)
     other = found.scores["result"]
     assert "the data set's poses are on the built-in hand" in found.remarks[0]
-    for key, value in own.items():
+    for key, value in own.scores["result"].items():
         assert other[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
 
 
 def test_ho3ds_truth_has_one_hand_and_knows_some_frames(
-    run: Path, tiny: Clip, tiny_clip: Path, tmp_path: Path, both_hands: dict[Side, HandModel]
+    run: Path,
+    own: Evaluation,
+    tiny: Clip,
+    tiny_clip: Path,
+    tmp_path: Path,
+    both_hands: dict[Side, HandModel],
 ) -> None:
-    own = evaluate_run(run, EvaluationPlan())
     annotation = load_annotation(tiny_clip)
     rest = {}
     for side, track in annotation.hands.items():
@@ -217,8 +230,7 @@ def test_a_submission_from_runs(run: Path, call: Callable[..., Answer], tiny: Cl
     )
 
 
-def test_a_comparison_names_what_it_shows(run: Path, tmp_path: Path) -> None:
-    found = evaluate_run(run, EvaluationPlan())
-    tables = compare_runs({"only": found}, tmp_path / "out")
+def test_a_comparison_names_what_it_shows(own: Evaluation, tmp_path: Path) -> None:
+    tables = compare_runs({"only": own}, tmp_path / "out")
     assert [row[0] for row in tables[0].rows][:2] == ["", "only"]
     assert not any(row[0].startswith("mean") for table in tables for row in table.rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack, ObjectTrack
 
 FRAMES = 5
@@ -47,3 +48,24 @@ def small_masks() -> list[np.ndarray]:
             mask[12:15, 2:6] = 250
         masks.append(mask)
     return masks
+
+
+def small_annotation() -> Annotation:
+    """Five frames of two random hands and a tetrahedron of 10 cm, half a metre away."""
+    rng = np.random.default_rng(5)
+    return Annotation(
+        name="small",
+        frame_names=tuple(f"{t:05d}.jpg" for t in range(FRAMES)),
+        width=WIDTH,
+        height=HEIGHT,
+        K=K,
+        cam_from_world=np.repeat(np.eye(4)[None], FRAMES, axis=0),
+        hands={"right": random_hand(rng), "left": random_hand(rng)},
+        object=ObjectTruth(
+            verts=0.1 * np.vstack([np.zeros(3), np.eye(3)]),
+            faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+            rotations=np.repeat(np.eye(3)[None], FRAMES, axis=0),
+            transl=np.repeat([[0.0, 0.0, 0.5]], FRAMES, axis=0),
+            valid=np.ones(FRAMES, dtype=bool),
+        ),
+    )

@@ -1,0 +1,78 @@
+"""Every preset and what may be chosen beside it, in hardly any steps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_line import run_bigs
+from safetensors.numpy import load_file
+from short_plans import short
+from small_vgg import torchvision_state
+
+from bigs.commands.reconstruct import reconstruct
+from bigs.train.config import GuidanceStage, OptimizeStage
+from bigs.train.presets import PRESETS
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("preset", ["fast", "full", "paper"])
+def test_every_preset_runs(tiny_clip: Path, tmp_path: Path, preset: str) -> None:
+    """All terms, groups and choices of a preset, on small fields and few steps."""
+    config = short(PRESETS[preset])
+    small = PRESETS["smoke"]
+    config = replace(
+        config,
+        hand=replace(config.hand, subdivisions=0, triplane=small.hand.triplane),
+        object=replace(config.object, n_gaussians=500, triplane=small.object.triplane),
+        initial=replace(config.initial, surface_resolution=40),
+    )
+    outcome = reconstruct(tiny_clip, tmp_path / "run", config)
+    names = {stage.name for stage in config.stages if not isinstance(stage, GuidanceStage)}
+    assert names <= outcome.report.seconds.keys()
+    written = load_file(tmp_path / "run" / "scene.safetensors")
+    assert all(np.isfinite(values).all() for values in written.values())
+    assert ("light" in written) == config.lighting
+
+
+def test_hands_may_be_kept_apart(tiny_clip: Path, tmp_path: Path) -> None:
+    config = short(PRESETS["smoke"])
+    config = replace(config, hand=replace(config.hand, shared=False))
+    reconstruct(tiny_clip, tmp_path / "run", config)
+    written = load_file(tmp_path / "run" / "scene.safetensors")
+    assert not np.array_equal(written["right.splats.colors"], written["left.splats.colors"])
+    assert not np.array_equal(written["right.betas"], written["left.betas"])
+
+
+def test_a_network_for_the_perceptual_term(tiny_clip: Path, tmp_path: Path) -> None:
+    """Its file goes in by an option, and its path into the configuration."""
+    weights, out = tmp_path / "vgg16.pth", tmp_path / "run"
+    torch.save(torchvision_state(), weights)
+    stages = [stage.name for stage in PRESETS["smoke"].stages if isinstance(stage, OptimizeStage)]
+    quick = [f"--set=stages.{stage}.steps=1" for stage in stages]
+    answer = run_bigs(
+        *(
+            "reconstruct",
+            tiny_clip,
+            "--preset",
+            "smoke",
+            "--out",
+            out,
+            "--perceptual-weights",
+            weights,
+            *quick,
+        ),
+        *("--set", "stages.joint.weights.perceptual=0.5"),
+    )
+    assert answer.code == 0, answer.err
+    assert "perceptual" not in answer.out
+    assert yaml.safe_load((out / "config.yaml").read_text())["config"]["perceptual_weights"] == [str(weights)]
+    events = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    (joint,) = [event for event in events if event["event"] == "step" and event["stage"] == "joint"]
+    assert joint["terms"]["perceptual"] > 0

@@ -1,0 +1,109 @@
+"""Interrupted runs that go on: to the same bytes, with every step logged once."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import Answer, Run, run_bigs
+from safetensors.numpy import load_file
+
+from bigs.commands.reconstruct import reconstruct
+from bigs.train.presets import PRESETS
+
+pytestmark = pytest.mark.slow
+
+
+def wait_for(log: Path, text: str, process: subprocess.Popen[bytes]) -> None:
+    until = time.monotonic() + 60
+    while not (log.exists() and text in log.read_text()):
+        assert process.poll() is None, "ended before it could be killed"
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+def test_killed_twice_and_resumed_it_ends_the_same(finished_run: Run, tmp_path: Path) -> None:
+    """Within a stage between two checkpoints, and again in a later stage; to the same bytes."""
+    out = tmp_path / "run"
+    # How often checkpoints are kept does not change the result.
+    command = [*finished_run.command, "--set", "checkpoint_every=4", "--out", str(out)]
+    for stage, step in (("hands-coarse", 10), ("appearance", 2)):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bigs.cli", *command, "--resume"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        wait_for(out / "log.jsonl", f'"step", "stage": "{stage}", "step": {step},', process)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        assert not (out / "scene.safetensors").exists()
+    answer = run_bigs(*command, "--resume")
+    assert answer.code == 0, answer.err
+    expected, found = (load_file(folder / "scene.safetensors") for folder in (finished_run.folder, out))
+    assert expected.keys() == found.keys()
+    assert [key for key in expected if not np.array_equal(expected[key], found[key])] == []
+    scores = [json.loads((folder / "metrics.json").read_text()) for folder in (finished_run.folder, out)]
+    assert scores[0] == scores[1]
+    bytes_of = [(folder / "scene.safetensors").read_bytes() for folder in (finished_run.folder, out)]
+    assert bytes_of[0] == bytes_of[1]
+
+
+def test_a_log_cut_short_does_not_stop_a_resume(
+    call: Callable[..., Answer], finished_run: Run, tmp_path: Path
+) -> None:
+    """A power cut may leave half a line; every number in it will be computed again."""
+    out = tmp_path / "run"
+    (out / "checkpoints").mkdir(parents=True)
+    for name in ("config.yaml", "checkpoints/latest.safetensors", "log.jsonl"):
+        (out / name).write_bytes((finished_run.folder / name).read_bytes())
+    with (out / "log.jsonl").open("a") as file:
+        file.write('{"event": "step", "stage": "jo')
+    answer = call(*finished_run.command[:4], "--out", out, "--resume")
+    assert answer.code == 0, answer.err
+    for line in (out / "log.jsonl").read_text().splitlines():
+        json.loads(line)
+
+
+def test_a_resumed_log_has_every_step_once(tiny_clip: Path, tmp_path: Path) -> None:
+    """Steps after the last checkpoint are run again; the report's curves must not go back in time."""
+    stage = replace(copy.deepcopy(PRESETS["smoke"].stages[0]), steps=6)
+    config = replace(PRESETS["smoke"], stages=(stage,), checkpoint_every=2)
+
+    def interrupt(event: dict[str, Any]) -> None:
+        if event["event"] == "step" and event["step"] == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(tiny_clip, tmp_path / "run", config, listen=interrupt)
+    reconstruct(tiny_clip, tmp_path / "run", config, resume=True)
+    events = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [e["step"] for e in events if e["event"] == "step"] == [1, 2, 3, 4, 5, 6]
+
+
+def test_before_the_first_checkpoint_options_may_change(tiny_clip: Path, tmp_path: Path) -> None:
+    """What is run and what config.yaml says are one; there is nothing yet that could be lost."""
+    stage = replace(copy.deepcopy(PRESETS["smoke"].stages[0]), steps=2)
+    config = replace(PRESETS["smoke"], stages=(stage,))
+
+    def interrupt(event: dict[str, Any]) -> None:
+        if event["event"] == "step":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(tiny_clip, tmp_path / "run", config, listen=interrupt)
+    reconstruct(tiny_clip, tmp_path / "run", replace(config, seed=3), resume=True)
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["config"]["seed"] == 3
+    events = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [e["step"] for e in events if e["event"] == "step"] == [1, 2]
