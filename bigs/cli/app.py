@@ -100,8 +100,9 @@ def _parse(arguments: list[str]) -> Callable[[], None]:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        # The parser draws a box of several lines; its words are kept, its frame is not.
-        words = " ".join(re.sub(r"[╭╮╰╯│─]+", " ", said.getvalue()).split())
+        # The parser draws a box of several lines; its words are kept, its frame and title are not.
+        lines = [line for line in said.getvalue().splitlines() if not line.startswith("╭")]
+        words = " ".join(re.sub(r"[╰╯│─]+", " ", " ".join(lines)).split())
         fail(words, 2)
         raise
 

@@ -19,7 +19,7 @@ EngineName = Literal["processes", "slurm", "ray"]
 
 
 def batch(
-    manifest: Annotated[Path, tyro.conf.Positional],
+    manifest: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")],
     out: Path,
     engine: EngineName = "processes",
     workers: int = 0,

@@ -59,7 +59,7 @@ def bench_engine(
 
 
 def bench_reconstruct(
-    clips: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CLIP ...")],
     out: Path = Path("bench"),
     presets: tuple[Preset, ...] = ("fast",),
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
-from bigs.cli.terminal import say
+from bigs.cli.terminal import ClipPath, say
 
 
 def convert(
-    clip: Annotated[Path, tyro.conf.Positional],
+    clip: ClipPath,
     out: Path,
     view: Literal["full", "limited"] = "full",
     every: int = 1,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bigs.cli.terminal import say, stderr, use_threads
+from bigs.cli.terminal import ClipPath, say, stderr, use_threads
 
 # As `guidance.diffusers_folder` has them, spelled out because importing that takes seconds; a test compares.
 Device = Literal["auto", "cpu", "cuda"]
@@ -15,7 +15,7 @@ Precision = Literal["auto", "float32", "float16", "bfloat16"]
 
 
 def prior_fit(
-    clip: Annotated[Path, tyro.conf.Positional],
+    clip: ClipPath,
     object: str,
     model: str,
     out: Path,
@@ -79,7 +79,7 @@ def prior_fit(
 
 
 def prior_train(
-    meshes: Annotated[Path, tyro.conf.Positional],
+    meshes: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MESHES")],
     out: Path,
     steps: int = 20_000,
     batch: int = 32,

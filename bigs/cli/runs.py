@@ -1,4 +1,4 @@
-"""Commands that make a run and use it: demo, info, reconstruct, eval, render, export, view, ablate."""
+"""Commands that make a run and use it: demo, info, reconstruct, render, export, view, ablate; and doctor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import tyro
 
 from bigs.cli.preprocess import NO_VIDEO, VideoOptions, clip_of
 from bigs.cli.terminal import (
+    ClipPath,
     Preset,
+    RunPath,
     fail_for,
     print_table,
     print_tables,
@@ -73,7 +75,7 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
     show(outcome)
 
 
-def info(clip: Annotated[Path, tyro.conf.Positional], hand_model: Path | None = None) -> None:
+def info(clip: ClipPath, hand_model: Path | None = None) -> None:
     """Check a clip and say what it holds.
 
     Args:
@@ -88,7 +90,7 @@ def info(clip: Annotated[Path, tyro.conf.Positional], hand_model: Path | None = 
 
 
 def reconstruct(
-    clip: Annotated[Path, tyro.conf.Positional],
+    clip: ClipPath,
     out: Path,
     preset: Preset = "full",
     hand_model: Path | None = None,
@@ -161,7 +163,7 @@ def reconstruct(
     show(outcome)
 
 
-def render(run: Annotated[Path, tyro.conf.Positional], cameras: Path, out: Path, threads: int = 0) -> None:
+def render(run: RunPath, cameras: Path, out: Path, threads: int = 0) -> None:
     """Render a finished run from the cameras of a transforms.json, as RGBA pictures with straight colour.
 
     Args:
@@ -178,7 +180,7 @@ def render(run: Annotated[Path, tyro.conf.Positional], cameras: Path, out: Path,
 
 
 def export(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunPath,
     format: Format,
     out: Path | None = None,
     frames: tuple[int, ...] = (),
@@ -216,7 +218,7 @@ def export(
 
 
 def view(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunPath,
     host: str = "127.0.0.1",
     port: int = 8080,
     clip: Path | None = None,
@@ -241,7 +243,7 @@ def view(
 
 
 def ablate(
-    clip: Annotated[Path, tyro.conf.Positional],
+    clip: ClipPath,
     out: Path,
     preset: Preset = "fast",
     rows: tuple[str, ...] | None = None,

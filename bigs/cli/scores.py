@@ -12,7 +12,7 @@ from bigs.cli.terminal import print_table, print_tables, say, stderr, use_thread
 
 
 def evaluate(
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN ...")],
     gt: Path | None = None,
     clip: Path | None = None,
     novel: Path | None = None,
@@ -64,7 +64,7 @@ def evaluate(
 
 
 def submission(
-    archive: Annotated[Path, tyro.conf.Positional],
+    archive: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ZIP")],
     runs: tuple[Path, ...] = (),
     sequences: tuple[str, ...] | None = None,
     hold_class: bool = False,

@@ -5,11 +5,16 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
+import tyro
 from rich.console import Console
 
 from bigs.checks import InputError
+
+# What a command works on, as its help calls it.
+ClipPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 if TYPE_CHECKING:
     from bigs.bench.page import Table
@@ -18,7 +23,10 @@ if TYPE_CHECKING:
 # The names of `train.presets.PRESETS`, spelled out because importing those takes seconds; a test compares.
 Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 
-stdout = Console()
+# A file or a pipe has no width; tables there are as wide as they need to be.
+_WIDTH_OF_A_FILE = 240
+
+stdout = Console(width=None if sys.stdout.isatty() else _WIDTH_OF_A_FILE)
 stderr = Console(stderr=True)
 
 
@@ -69,8 +77,10 @@ def print_table(rows: list[tuple[str, ...]]) -> None:
 
     heading, *body = rows
     table = Table(*heading)
-    for column in table.columns:
+    for index, column in enumerate(table.columns):
         column.overflow = "fold"
+        # Where it is narrow, headings and long sentences are folded, not numbers and names.
+        column.min_width = min(24, max((len(row[index]) for row in body), default=0))
     for column in table.columns[1:]:
         column.justify = "right"
     for row in body:

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import fake_slurm
 import pytest
 import yaml
 
@@ -113,16 +114,37 @@ def test_a_worker_is_killed_mid_clip(clip: Path, tmp_path: Path, engine: str) ->
     # Called again, nothing is done twice: only the missing clip is tried.
     before = {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names}
     again = start(path, "--out", out, "--threads", "1", said=said)
-    assert again.wait(120) == 5
+    assert again.wait(300) == 5
     assert "clips were finished before; 1 attempts" in said.read_text()
     assert {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names} == before
 
 
 def test_submitit_in_processes_of_its_own(clip: Path, tmp_path: Path) -> None:
+    """Without a cluster, to try it out; that the jobs do what they should is shown with Slurm's programs."""
     pytest.importorskip("submitit", reason="needs the extra 'slurm'")
     out, said = tmp_path / "out", tmp_path / "said"
     options = ["--engine", "slurm", "--slurm-cluster", "local", "--threads", "1", "--slurm", "timeout_min=5"]
-    assert start(manifest(tmp_path, clip, ["a"]), "--out", out, *options, said=said).wait(200) == 5
+    batch = start(manifest(tmp_path, clip, []), "--out", out, *options, said=said)
+    assert batch.wait(300) == 5, said.read_text()
+    found = statuses(out)["gone"]
+    assert found["state"] == "failed" and found["pid"] not in (0, batch.pid)
+
+
+def test_jobs_of_a_slurm_cluster(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As submitit speaks to Slurm; the programs that answer are stand-ins."""
+    pytest.importorskip("submitit", reason="needs the extra 'slurm'")
+    slurm, out, said = tmp_path / "slurm", tmp_path / "out", tmp_path / "said"
+    for name, value in fake_slurm.install(slurm).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PATH", f"{slurm}{os.pathsep}{os.environ['PATH']}")
+    options = ["--engine", "slurm", "--threads", "1", "--slurm", "slurm_partition=cpu"]
+    batch = start(manifest(tmp_path, clip, ["a"]), "--out", out, *options, said=said)
+    assert batch.wait(300) == 5, said.read_text()
     found = statuses(out)
     assert (found["a"]["state"], found["gone"]["state"]) == ("finished", "failed"), said.read_text()
     assert found["a"]["pid"] != found["gone"]["pid"]
+    assert (out / "a" / "report.html").is_file()
+    assert len((slurm / "submitted").read_text().splitlines()) == 2
+    for script in slurm.glob("*.sh"):
+        lines = script.read_text().splitlines()
+        assert {"#SBATCH --cpus-per-task=1", "#SBATCH --partition=cpu", "#SBATCH --job-name=bigs"} <= {*lines}
