@@ -80,7 +80,8 @@ def info(clip: ClipPath, hand_model: Path | None = None) -> None:
 
     Args:
         clip: a clip of any layout: a HOLD / HANDS-challenge build folder, a sequence of ARCTIC's raw release
-            (ROOT/images/s05/box_grab_01/1), a clip of HO-3D (ROOT/train/SM1).
+            (ROOT/images/s05/box_grab_01/1), a clip of HO-3D (ROOT/train/SM1), a COLMAP or nerfstudio folder
+            with hands.npz.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
     """
     from bigs.commands.inspect import describe_clip
@@ -231,7 +232,7 @@ def view(
         host: address to listen at; the default can be reached from this machine only.
         port: where to listen; the next free port is taken if it is in use.
         clip: the clip with the input images, if it is not where the run found it.
-        gt: ground truth (gt.npz) to show beside the result.
+        gt: ground truth to show beside the result, as for bigs eval.
     """
     from bigs.commands.view import view as serve
 

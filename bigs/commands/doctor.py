@@ -51,7 +51,7 @@ EXTRAS: dict[str, Extra] = {
     "slurm": Extra(("submitit",), "bigs batch --engine slurm"),
     "ray": Extra(("ray",), "bigs batch --engine ray"),
     "browser": Extra(("playwright",), "the tests of the viewer and the report in a browser"),
-    "dev": Extra(("maturin", "pytest", "hypothesis"), "building and testing bigs itself"),
+    "dev": Extra(("maturin", "pytest", "xdist", "hypothesis"), "building and testing bigs itself"),
 }
 # Environment variables that name data, and what that is for.
 VARIABLES = {
@@ -60,7 +60,13 @@ VARIABLES = {
     "BIGS_HAND_MODEL": "hand models for the tests",
 }
 # The distribution that a module comes with, where its name differs.
-DISTRIBUTIONS = {"skimage": "scikit-image", "PIL": "pillow", "yaml": "pyyaml", "rerun": "rerun-sdk"}
+DISTRIBUTIONS = {
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+    "yaml": "pyyaml",
+    "rerun": "rerun-sdk",
+    "xdist": "pytest-xdist",
+}
 
 
 def examine() -> list[tuple[str, list[Finding]]]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import replace
+from pathlib import Path, PurePath
 
 import numpy as np
 import torch
@@ -26,7 +27,8 @@ def load_truth(
 
     Args:
         path: `gt.npz` or the folder that holds it, a sequence of ARCTIC's raw release, or a clip of HO-3D.
-        frame_names: the frames wanted from a data set, by their own names; `gt.npz` gives those that it has.
+        frame_names: the frames wanted, by their own names. Where none is named, or `gt.npz` lacks one, it
+            gives all that it has; `match_frames` will say what does not fit.
         hand_models: those that the data set's poses were fitted with; `gt.npz` needs none.
 
     Returns:
@@ -36,8 +38,23 @@ def load_truth(
         InputError: no truth there, or it is not as it should be.
     """
     if is_own_truth(path):
-        return load_ground_truth(path)
+        return _frames_of(load_ground_truth(path), frame_names)
     return pose_annotation(read_annotation(path, frame_names, hand_models), hand_models)
+
+
+def _frames_of(truth: HandObjectTrajectory, frame_names: Sequence[str]) -> HandObjectTrajectory:
+    """Of a clip's truth the frames that an excerpt of the clip has; all of it if it lacks one of them."""
+    wanted = {PurePath(name).stem for name in frame_names}
+    kept = [t for t, name in enumerate(truth.frame_names) if PurePath(name).stem in wanted]
+    if not kept or len(kept) != len(frame_names) or len(kept) == len(truth.frame_names):
+        return truth
+    return replace(
+        truth,
+        frame_names=tuple(truth.frame_names[t] for t in kept),
+        joints={side: joints[kept] for side, joints in truth.joints.items()},
+        verts={side: verts[kept] for side, verts in truth.verts.items()},
+        object_verts=None if truth.object_verts is None else truth.object_verts[kept],
+    )
 
 
 def is_own_truth(path: Path) -> bool:

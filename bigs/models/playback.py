@@ -206,12 +206,12 @@ def record(
         )
     obj = None
     if scene.object_splats is not None:
-        pose = scene.object_frames(frames)
+        placed = scene.object_frames(frames)
         surface = scene.object_surface
         obj = ObjectPlayback(
-            pose.rotations,
-            pose.centers,
-            pose.scale,
+            placed.rotations,
+            placed.centers,
+            placed.scale,
             surface.verts,
             surface.faces,
             canonical["object"],

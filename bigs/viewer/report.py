@@ -94,10 +94,10 @@ def write_report(
     parts = [f"<h1>{escape(title)}</h1>"]
     if facts:
         parts.append(_table([("", ""), *facts.items()]))
-    if metrics:
-        parts += ["<h2>Scores</h2>", _table(metrics)]
     for caption, picture in (pictures or {}).items():
         parts.append(_figure(caption, picture))
+    if metrics:
+        parts += ["<h2>Scores</h2>", _table(metrics)]
     if frames:
         parts.append(_slider(frames))
     if video is not None:
