@@ -16,6 +16,7 @@ import pytest
 import torch
 from browser import changed, open_page, picture, until
 from command_line import Answer, Run, assert_refused
+from PIL import Image
 
 from bigs.commands.rendering import render_frame
 from bigs.commands.run_folder import load_run
@@ -195,6 +196,19 @@ def test_through_the_input_camera_it_shows_what_the_engine_draws(page: Any, fini
         return bool((shown & drawn).sum() > 0.9 * (shown | drawn).sum())
 
     until(page, agrees, part)
+
+
+def test_the_picture_of_the_readme_can_be_taken_again(page: Any, finished_run: Run, tmp_path: Path) -> None:
+    """By the program that took it; `page` skips where there is no browser."""
+    out = tmp_path / "viewer.png"
+    script = Path(__file__).parents[2] / "docs" / "viewer_picture.py"
+    command = [sys.executable, script, finished_run.folder, "--out", out, "--width", "640", "--height", "400"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "640 x 400" in done.stdout and out.stat().st_size < 300_000
+    shown = np.asarray(Image.open(out).convert("RGB")).astype(int)[:, :320]
+    skin = shown[..., 0] > shown[..., 2] + 30
+    assert skin.sum() > 300
 
 
 def test_an_address_of_another_machine_is_refused(call: Callable[..., Answer], finished_run: Run) -> None:
