@@ -104,7 +104,10 @@ def write_report(
         if not Path(video).is_file():
             raise InputError(f"{video}: expected a video for the report, found no such file")
         source = _embedded(Path(video).read_bytes(), "video/mp4")
-        parts.append(f'<h2>Video</h2><video controls loop muted src="{source}"></video>')
+        # Browsers may leave the place of a video empty until it is played.
+        first = _embedded(_jpeg(frames[0][1], _FRAME_QUALITY), "image/jpeg") if frames else ""
+        poster = f' poster="{first}"' if first else ""
+        parts.append(f'<h2>Video</h2><video controls loop muted{poster} src="{source}"></video>')
     errors = [line_plot(name, range(len(y)), y) for name, y in (per_frame or {}).items()]
     if any(errors):
         parts.append(f'<h2>Errors frame by frame</h2><div class="curves">{"".join(errors)}</div>')

@@ -91,7 +91,7 @@ def test_it_asks_for_nothing_outside_itself(report):
     sources = [
         value for _, name, value in Page(report).attributes if name in ("src", "href", "data", "poster")
     ]
-    assert len(sources) == 1 + 5 + 1 + 1  # sheet, frames, map, video
+    assert len(sources) == 1 + 5 + 1 + 2  # sheet, frames, map, video and what stands for it
     assert all(source.startswith("data:") for source in sources)
     assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", report)
     assert "@import" not in report
