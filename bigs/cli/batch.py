@@ -57,7 +57,11 @@ def batch(
 
     if retries < 0:
         raise InputError(f"--retries: expected 0 or more, found {retries}")
-    for name, value, owner in (("--ray-address", ray_address, "ray"), ("--slurm", slurm, "slurm")):
+    for name, value, owner in (
+        ("--ray-address", ray_address, "ray"),
+        ("--slurm", slurm, "slurm"),
+        ("--slurm-cluster", slurm_cluster == "local", "slurm"),
+    ):
         if value and engine != owner:
             raise InputError(f"{name}: expected --engine {owner}, found {engine}")
 

@@ -82,5 +82,7 @@ def submission(
     """
     from bigs.commands.submission import submit
 
+    if hold_class and not runs:
+        raise InputError("--hold-class: expected --runs with it, found none")
     print_table(submit(archive, runs, sequences, hold_class=hold_class))
     say(f"{archive} is complete")

@@ -219,6 +219,7 @@ def test_threads_are_shared_out(
         ("--workers -1", ["--workers", "found -1"]),
         ("--ray-address here", ["--ray-address", "--engine ray", "found processes"]),
         ("--slurm a=b", ["--slurm", "--engine slurm", "found processes"]),
+        ("--slurm-cluster local", ["--slurm-cluster", "--engine slurm", "found processes"]),
         ("--engine slurm --slurm partition", ["--slurm partition", "expected name=value"]),
         ("--set nothing=1", ["--set nothing=1", "no setting 'nothing'"]),
         ("--engine slurm", ["--engine slurm", "expected a cluster"]),

@@ -225,6 +225,7 @@ def test_a_submission_from_runs(run: Path, call: Callable[..., Answer], tiny: Cl
     assert answer.code == 0 and "is complete" in answer.out and tiny.name in answer.out
     assert call("submission", archive, "--sequences", tiny.name).code == 0
     assert_refused(call("submission", archive), "expected the 9 sequences of the challenge")
+    assert_refused(call("submission", archive, "--hold-class"), "--hold-class: expected --runs with it")
     assert_refused(
         call("submission", archive, "--runs", tmp_path), "arctic_preds: expected the run's prediction"
     )
