@@ -24,7 +24,7 @@ class Run(NamedTuple):
     answer: Answer
 
 
-def run_bigs(*arguments: str | Path, timeout: float = 120) -> Answer:
+def run_bigs(*arguments: str | Path, timeout: float = 600) -> Answer:
     """The command line in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "bigs.cli", *map(str, arguments)],

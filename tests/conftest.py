@@ -58,7 +58,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_clip: Path) -> R
     """`bigs reconstruct` of the tiny clip with the smoke preset. Read it, never write into it."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
-    return Run(folder, command, run_bigs(*command, "--out", folder, timeout=600))
+    return Run(folder, command, run_bigs(*command, "--out", folder))
 
 
 @pytest.fixture
