@@ -30,6 +30,7 @@ STEPS = {
     "held": 3,
     "appearance": 3,
     "contact": 3,
+    "regrasp": 3,
     "joint": 4,
     "detail": 3,
 }

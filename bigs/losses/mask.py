@@ -6,15 +6,17 @@ import torch
 from torch import Tensor
 
 
-def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
+def outside_mask(pred: Tensor, foreground: Tensor, n_outside: Tensor | None = None) -> Tensor:
     """The paper's mask regulariser (1 - m) I_pred (Eq. 5), a mean over the outside's pixels and channels.
 
     Args:
-        pred: [B, H, W, D], rendered on black.
-        foreground: [B, H, W] in [0, 1], union of all subjects' masks.
+        pred: [..., D], rendered on black.
+        foreground: [...] in [0, 1], union of all subjects' masks.
+        n_outside: how many pixels are outside, where `pred` lacks those that are black.
     """
     outside = 1.0 - foreground
-    return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
+    count = outside.sum() if n_outside is None else n_outside
+    return (pred.abs() * outside[..., None]).sum() / (count * pred.shape[-1]).clamp_min(1.0)
 
 
 def outside_mask_on(colors: Tensor, alphas: Tensor, foreground: Tensor, generator: torch.Generator) -> Tensor:
@@ -54,7 +56,7 @@ def label_difference(pred: Tensor, labels: Tensor) -> Tensor:
     """Entity channels of one joint rendering against the visible masks: occlusion order included.
 
     Args:
-        pred: [B, H, W, E] rendered label channels.
-        labels: [B, H, W, E] visible shares.
+        pred: [..., E] rendered label channels.
+        labels: [..., E] visible shares.
     """
     return (pred - labels).square().sum() / labels.sum().clamp_min(1.0)

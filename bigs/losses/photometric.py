@@ -14,8 +14,8 @@ def masked_l1(pred: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     weight serve every resolution.
 
     Args:
-        pred, target: [B, H, W, 3] in [0, 1].
-        mask: [B, H, W] in [0, 1].
+        pred, target: [..., 3] in [0, 1].
+        mask: [...] in [0, 1].
     """
     difference = (pred - target).abs() * mask[..., None]
     return difference.sum() / (mask.sum() * pred.shape[-1]).clamp_min(1.0)
@@ -32,6 +32,6 @@ def masked_mse(pred: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 
 def masked_ssim(pred: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """1 - SSIM of the two masked images; arguments as in `masked_l1`."""
+    """1 - SSIM of the two masked images: pred, target [B, H, W, 3], mask [B, H, W]."""
     pred, target = ((image * mask[..., None]).movedim(-1, 1) for image in (pred, target))
     return 1.0 - ssim(pred, target)

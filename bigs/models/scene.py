@@ -142,6 +142,10 @@ class Scene(nn.Module):
         )
         return poses(frames, HandFrames(*start), torch.where(held, grasps.slack, 1.0))
 
+    def free_frames(self, side: Side) -> Tensor:
+        """The frames in which a hand belongs to no grasp, rising."""
+        return torch.nonzero(self.grasps[side].of_frame < 0).flatten()
+
     def object_frames(self, frames: Tensor) -> ObjectFrames:
         return self.object_poses(frames)
 

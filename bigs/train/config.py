@@ -30,6 +30,8 @@ class OptimizeStage:
     image_size: int = 0
     # How many frames share one evaluation of the canonical fields; 0 takes the whole clip.
     frames_per_step: int = 0
+    # Only the frames in which a hand holds nothing, each hand's own; those of its grasps stay as they are.
+    free_frames: bool = False
     # Learning rates fall along a cosine to this share.
     final_lr: float = 0.1
     # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.

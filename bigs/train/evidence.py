@@ -14,15 +14,16 @@ from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.scene import Scene
 from bigs.train.config import RunConfig, ScaleSearchStage, Stage
 from bigs.train.initial import touching_frames
+from bigs.train.step import Evidence, Step
 from bigs.train.targets import Targets, crop_box, load_targets
-from bigs.train.terms import Evidence, Step, labels
+from bigs.train.terms import labels
 from bigs.types import Side
 
 # Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
 SILHOUETTE_SIGMA = 0.0022
 # Centres go in by this many standard deviations of a Gaussian as it appears in the image. Opaque neighbours
 # overlap, so their common alpha falls to one half well outside the centres.
-INSET = 1.85
+INSET = 2.0
 
 
 class EvidenceSource:
@@ -42,7 +43,8 @@ class EvidenceSource:
         self.config = config
         self.perceptual = perceptual
         self.box = crop_box(clip)
-        self.touching: dict[Side, Tensor] = {
+        # Where the masks of hand and object meet.
+        self.meeting: dict[Side, Tensor] = {
             side: torch.as_tensor(touching_frames(clip, side), dtype=torch.float32)
             if scene.object_splats is not None
             else torch.zeros(len(clip))
@@ -50,11 +52,22 @@ class EvidenceSource:
         }
         self._targets: dict[int, Targets] = {}
 
+    def touching(self) -> dict[Side, Tensor]:
+        """For each hand [T] 1 where it touches the object, as far as is known by now.
+
+        Masks also meet where a hand only passes before the object; once its grasps are found, they count.
+        """
+        touching = {}
+        for side, meeting in self.meeting.items():
+            grasps = self.scene.grasps[side]
+            touching[side] = (grasps.of_frame >= 0).to(meeting) if grasps.count else meeting
+        return touching
+
     def evidence(self, stage: Stage) -> Evidence:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(
-            targets, self.touching, silhouettes, self.config.contact, self.config.raster, self.perceptual
+            targets, self.touching(), silhouettes, self.config.contact, self.config.raster, self.perceptual
         )
 
     def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:

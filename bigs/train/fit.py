@@ -131,10 +131,10 @@ def fit(
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
         began = time.perf_counter() - report.seconds.get(stage.name, 0.0)
         if isinstance(stage, ScaleSearchStage):
-            factor, _, _ = search_object_scale(scene, stage, sources.touching, sources.occlusion(stage))
+            factor, _, _ = search_object_scale(scene, stage, sources.touching(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
         elif isinstance(stage, GraspStage):
-            for side, stretches in find_grasps(scene, stage, sources.touching).items():
+            for side, stretches in find_grasps(scene, stage, sources.meeting).items():
                 spans = ", ".join(f"{stretch.start}-{stretch.stop - 1}" for stretch in stretches)
                 text = f"{side} hand holds the object in frames {spans or '(none)'}"
                 listen({"event": "note", "stage": stage.name, "text": text})
@@ -268,6 +268,8 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
         return "the clip has no object" if scene.object_splats is None and not stage.hands else None
     if not stage.weights:
         return "no loss term is left"
+    if stage.free_frames and not any(len(scene.free_frames(side)) for side in scene.sides):
+        return "in every frame the hands hold the object"
     # The clip's light and shade alone are no subject.
     subjects = {group.split(".")[0] for group in stage.lrs} - {"scene"}
     if subjects == {"hand"} and not scene.sides:

@@ -16,8 +16,8 @@ from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.train.config import GuidanceStage
 from bigs.train.guided import Coverage, coverage_of, follow, guide_object
-from bigs.train.terms import Evidence
-from bigs.train.terms import Step as LossStep
+from bigs.train.step import Evidence
+from bigs.train.step import Step as LossStep
 
 # A Gaussian counts as seen when it shows in so many frames; poses are wrong by about so much, metres.
 _LEAST_FRAMES, _TOLERANCE = 3, 0.006

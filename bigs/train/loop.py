@@ -15,7 +15,8 @@ from bigs.losses.weighted import weighted_sum
 from bigs.models.scene import Scene
 from bigs.train.config import OptimizeStage
 from bigs.train.optim import FIELD_GROUPS, make_optimizer, set_cosine_rates
-from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence, Step
+from bigs.train.step import Evidence, Step
+from bigs.train.terms import IMAGE_TERMS, TERMS
 from bigs.types import Entity
 
 
@@ -52,7 +53,10 @@ def stage_entities(scene: Scene, stage: OptimizeStage) -> tuple[Entity, ...]:
         return scene.entities
     subjects = {group.split(".")[0] for group in stage.lrs}
     return tuple(
-        entity for entity in scene.entities if ("object" if entity == "object" else "hand") in subjects
+        entity
+        for entity in scene.entities
+        if ("object" if entity == "object" else "hand") in subjects
+        and not (stage.free_frames and entity != "object" and len(scene.free_frames(entity)) == 0)
     )
 
 
@@ -139,12 +143,15 @@ def run_stage(
             choose_frames(scene.n_frames, stage, seed, state.step),
             "labels" in stage.weights,
             seed * 1_000_003 + state.step,
+            stage.free_frames,
         )
         terms, problem = _evaluate(step, stage)
         loss = weighted_sum(terms, stage.weights) if problem is None else None
         if loss is not None:
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
+            if stage.free_frames:
+                _spare_grasps(scene)
             problem = _unbounded_gradient(scene)
         if loss is None or problem is not None:
             where = f"stage {stage.name}, step {state.step}: {problem}"
@@ -170,6 +177,15 @@ def run_stage(
             state,
         )
     return state
+
+
+def _spare_grasps(scene: Scene) -> None:
+    """Take the gradient off the frames in which a hand holds the object: they stay as they are."""
+    for side, poses in scene.hand_poses.items():
+        held = scene.grasps[side].of_frame >= 0
+        for residual in (poses.orient, poses.pose, poses.position.ray, poses.position.log_depth):
+            if residual.grad is not None:
+                residual.grad[held] = 0.0
 
 
 def _evaluate(step: Step, stage: OptimizeStage) -> tuple[dict[str, Tensor], str | None]:

@@ -54,6 +54,10 @@ def check_plan(config: RunConfig) -> None:
         _check_numbers(f"{where}.", stage, _LEAST_OF_STAGE[type(stage)])
         if isinstance(stage, OptimizeStage):
             _check_names(where, stage)
+            if stage.free_frames and stage.step != "single-subject":
+                raise InputError(
+                    f"{where}: expected free_frames with step single-subject, found {stage.step}"
+                )
     if config.raster.tile_size not in TILE_SIZES:
         raise InputError(
             f"config raster.tile_size: expected {TILE_SIZES[0]}, {TILE_SIZES[1]} or {TILE_SIZES[2]}, "

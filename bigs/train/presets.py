@@ -50,7 +50,7 @@ _HANDS_FINE = replace(
         "hand.betas": 0.015,
     },
     weights={"silhouette": 1.0, **_POSE_PRIORS, "rigid": 0.03},
-    image_size=120,
+    image_size=160,
     final_lr=0.1,
 )
 # Grasps are known: what all frames of one agree on moves together.
@@ -88,6 +88,18 @@ _APPEARANCE = OptimizeStage(
     weights={"image": 1.0, "ssim": 0.2, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0, "lbs": 1000.0},
     image_size=240,
     frames_per_step=6,
+)
+
+# Between grasps nothing carries a hand, and a few frames decide: many steps for them alone. Their depth is
+# read off the size of outlines, which must be right to a fraction of a per cent (see `evidence.INSET`).
+_REGRASP = OptimizeStage(
+    name="regrasp",
+    step="single-subject",
+    steps=120,
+    lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
+    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002},
+    image_size=160,
+    free_frames=True,
 )
 
 # Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
@@ -152,7 +164,7 @@ _JOINT = OptimizeStage(
 _DETAIL = replace(
     _JOINT,
     name="detail",
-    steps=60,
+    steps=100,
     lrs={
         **_JOINT.lrs,
         "hand.orient": 0.002,
@@ -183,6 +195,7 @@ FAST = RunConfig(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
+        _REGRASP,
         SplitStage(),
         _JOINT,
         _DETAIL,
@@ -202,6 +215,7 @@ DEMO = replace(
         replace(_APPEARANCE, steps=40),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
+        replace(_REGRASP, steps=60),
         SplitStage(),
         replace(_JOINT, steps=110),
         GuidanceStage(steps=150),
@@ -215,17 +229,18 @@ FULL = replace(
     object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
     stages=(
         replace(_HANDS_COARSE, steps=100),
-        replace(_HANDS_FINE, steps=200, image_size=160),
+        replace(_HANDS_FINE, steps=200),
         ScaleSearchStage(),
         GraspStage(),
-        replace(_HELD, steps=100, image_size=160),
+        replace(_HELD, steps=100),
         replace(_APPEARANCE, steps=200),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
-        replace(_CONTACT, steps=100, image_size=160),
+        replace(_CONTACT, steps=100),
+        replace(_REGRASP, steps=300),
         SplitStage(),
-        replace(_JOINT, steps=400),
-        replace(_DETAIL, steps=400, image_size=640),
+        replace(_JOINT, steps=500),
+        replace(_DETAIL, steps=900, image_size=640),
         GuidanceStage(steps=600),
     ),
 )
@@ -245,6 +260,7 @@ SMOKE = replace(
         replace(_HELD, steps=8, image_size=80),
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
+        replace(_REGRASP, steps=8, image_size=80),
         SplitStage(),
         replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
         replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),

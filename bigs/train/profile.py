@@ -18,7 +18,7 @@ import torch
 
 from bigs.models.scene import Scene
 from bigs.raster import rust
-from bigs.train import terms
+from bigs.train import step, terms
 
 # What a step's time is split into; what is in none of them is the stage's `rest`.
 PHASES = (
@@ -139,7 +139,7 @@ def profiled() -> Iterator[Profile]:
         (Scene, "hand_points", _POSING),
         (Scene, "hand_frames", _POSING),
         (terms, "pose_hand", _POSING),
-        (terms, "rasterization", _ENGINE),
+        (step, "rasterization", _ENGINE),
         (rust._raster, "rasterize_backward", _ENGINE_BACK),
         (torch.Tensor, "backward", _BACK),
         (torch.optim.Adam, "step", _OPTIMISER),

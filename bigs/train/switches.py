@@ -121,6 +121,15 @@ def _search_labels(config: RunConfig) -> RunConfig:
     )
 
 
+def _free_frames(config: RunConfig) -> RunConfig:
+    return replace(
+        config,
+        stages=tuple(
+            stage for stage in config.stages if not (isinstance(stage, OptimizeStage) and stage.free_frames)
+        ),
+    )
+
+
 def _pyramid(config: RunConfig) -> RunConfig:
     sizes = [stage.image_size for stage in config.stages if isinstance(stage, OptimizeStage)]
     finest = 0 if 0 in sizes else max(sizes, default=0)
@@ -159,8 +168,9 @@ _INGREDIENTS = {
     "scale_search": Switch("the search of the object's size alone", _scale_search),
     "grasps": Switch(
         "grasps, in which the object carries a hand",
-        _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS)),
+        _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),
     ),
+    "free_frames": Switch("steps for the frames between grasps alone", _free_frames),
     "lighting": Switch(
         "light and shade",
         _all_of(

@@ -24,15 +24,14 @@ class Targets:
     width: int
     height: int
 
-    @property
-    def foreground(self) -> Tensor:
-        """Share of each pixel [T, H, W] that shows any entity."""
-        return torch.stack(list(self.shares.values())).sum(0).clamp(max=1.0)
+    def foreground(self, frames: Tensor) -> Tensor:
+        """Share of each pixel that shows any entity, in `frames` [B]: [B, H, W]."""
+        return torch.stack([share[frames] for share in self.shares.values()]).sum(0).clamp(max=1.0)
 
-    def hidden(self, entity: Entity) -> Tensor:
-        """Share of each pixel [T, H, W] in which something else may hide this entity."""
-        others = [share for other, share in self.shares.items() if other != entity]
-        return torch.stack([self.unknown, *others]).sum(0).clamp(max=1.0)
+    def hidden(self, entity: Entity, frames: Tensor) -> Tensor:
+        """Share of each pixel in which something else may hide this entity, in `frames` [B]: [B, H, W]."""
+        others = [share[frames] for other, share in self.shares.items() if other != entity]
+        return torch.stack([self.unknown[frames], *others]).sum(0).clamp(max=1.0)
 
 
 def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:

@@ -3,125 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from bigs.losses.contact import center_contact, penetration, surface_contact
 from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on
-from bigs.losses.perceptual import VggWeights, masked_perceptual
+from bigs.losses.perceptual import masked_perceptual
 from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
-from bigs.models.hand_splats import CanonicalHand, pose_hand
-from bigs.models.object_splats import CanonicalObject
-from bigs.models.scene import Scene, concatenate
-from bigs.raster import rasterization
-from bigs.raster.settings import RasterSettings
-from bigs.train.targets import Targets
-from bigs.types import Entity, Gaussians, RenderOutput, Side
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a stage's terms look at besides the scene; fixed for the stage."""
-
-    targets: Targets
-    touching: dict[Side, Tensor]  # [T] 1 where the masks of hand and object meet
-    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands, of this resolution
-    contact: str  # "center" or "surface"
-    settings: RasterSettings
-    perceptual: VggWeights | None = None  # what the term "perceptual" needs
-
-
-@dataclass
-class Step:
-    """One optimisation step over some frames: holds the canonical Gaussians and what was made from them."""
-
-    scene: Scene
-    evidence: Evidence
-    entities: tuple[Entity, ...]  # rendered alone or together in this stage
-    canonical: dict[Entity, CanonicalHand | CanonicalObject]
-    frames: Tensor  # [B]
-    with_labels: bool = True  # whether the joint rendering has label channels
-    seed: int = 0  # of what the terms draw
-    _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
-
-    @property
-    def sides(self) -> tuple[Side, ...]:
-        return tuple(e for e in self.entities if e != "object")
-
-    @cached_property
-    def everything(self) -> Tensor:
-        """All frames of the clip, for terms over time."""
-        return torch.arange(self.scene.n_frames)
-
-    @cached_property
-    def images(self) -> Tensor:
-        return self.evidence.targets.images[self.frames]
-
-    @cached_property
-    def foreground(self) -> Tensor:
-        return self.evidence.targets.foreground[self.frames]
-
-    def share(self, entity: Entity) -> Tensor:
-        return self.evidence.targets.shares[entity][self.frames]
-
-    def generator(self) -> torch.Generator:
-        """A fresh one for each term, so that what one term draws does not depend on the others."""
-        return torch.Generator().manual_seed(self.seed)
-
-    def render(self, gaussians: Gaussians) -> RenderOutput:
-        """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
-        targets = self.evidence.targets
-        out = rasterization(
-            *gaussians,
-            torch.eye(4)[None],
-            targets.K[None],
-            targets.width,
-            targets.height,
-            settings=self.evidence.settings,
-        )
-        return RenderOutput(out.colors[:, 0], out.alphas[:, 0], out.info)
-
-    def alone(self, entity: Entity) -> RenderOutput:
-        """One subject rendered without the others (the paper's single-subject step)."""
-        if entity not in self._alone:
-            self._alone[entity] = self.render(self.scene.posed(entity, self.canonical[entity], self.frames))
-        return self._alone[entity]
-
-    @cached_property
-    def together(self) -> RenderOutput:
-        """All subjects in one pass; after the three colours, one label channel per entity if labels count."""
-        labels = torch.eye(len(self.entities))
-        parts = []
-        for entity, label in zip(self.entities, labels, strict=True):
-            part = self.scene.posed(entity, self.canonical[entity], self.frames)
-            if self.with_labels:
-                channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
-                part = part._replace(colors=channels)
-            parts.append(part)
-        return self.render(concatenate(parts))
-
-    @cached_property
-    def hands(self) -> dict[Side, tuple[Tensor, Tensor]]:
-        """Vertices and joints of every hand in every frame of the clip."""
-        return {side: self.scene.hand_points(side, self.everything) for side in self.scene.sides}
-
-    @cached_property
-    def object_distances(self) -> dict[Side, Tensor]:
-        """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
-        scale = self.scene.object_poses.log_scale.exp()
-        return {
-            side: scale * self.scene.object_distance(self.scene.in_object_frame(verts, self.everything))
-            for side, (verts, _) in self.hands.items()
-        }
-
-    @property
-    def has_object(self) -> bool:
-        return self.scene.object_splats is not None
+from bigs.models.hand_splats import pose_hand
+from bigs.train.step import Step
+from bigs.types import Entity, Side
 
 
 def _mean(values: Iterable[Tensor]) -> Tensor:
@@ -130,7 +24,7 @@ def _mean(values: Iterable[Tensor]) -> Tensor:
 
 
 def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
-    return _mean(loss(step.alone(entity).colors, step.images, step.share(entity)) for entity in step.entities)
+    return _mean(loss(step.alone(entity).colors, *step.seen_alone(entity)) for entity in step.entities)
 
 
 def image_alone(step: Step) -> Tensor:
@@ -145,14 +39,25 @@ def ssim_alone(step: Step) -> Tensor:
     return _each_alone(step, masked_ssim)
 
 
+def _foreground_alone(step: Step, entity: Entity) -> Tensor:
+    return step.evidence.targets.foreground(step.frames_of(entity))
+
+
 def mask_alone(step: Step) -> Tensor:
-    return _mean(outside_mask(step.alone(entity).colors, step.foreground) for entity in step.entities)
+    return _mean(
+        outside_mask(step.alone(entity).colors, _foreground_alone(step, entity)) for entity in step.entities
+    )
 
 
 def mask_random_alone(step: Step) -> Tensor:
     generator = step.generator()
     return _mean(
-        outside_mask_on(step.alone(entity).colors, step.alone(entity).alphas, step.foreground, generator)
+        outside_mask_on(
+            step.alone(entity).colors,
+            step.alone(entity).alphas,
+            _foreground_alone(step, entity),
+            generator,
+        )
         for entity in step.entities
     )
 
@@ -161,7 +66,7 @@ def perceptual_alone(step: Step) -> Tensor:
     generator = step.generator()
     return _mean(
         masked_perceptual(
-            step.alone(entity).colors, step.images, step.share(entity), step.evidence.perceptual, generator
+            step.alone(entity).colors, *step.seen_alone(entity), step.evidence.perceptual, generator
         )
         for entity in step.entities
     )
@@ -170,20 +75,20 @@ def perceptual_alone(step: Step) -> Tensor:
 def coverage_alone(step: Step) -> Tensor:
     """Each subject opaque on its own pixels, absent from the background, free where others may hide it."""
     targets = step.evidence.targets
-    return _mean(
-        amodal_silhouette(
-            step.alone(entity).alphas[..., 0], step.share(entity), targets.hidden(entity)[step.frames]
-        )
-        for entity in step.entities
-    )
+
+    def one(entity: Entity) -> Tensor:
+        hidden = targets.hidden(entity, step.frames_of(entity))
+        return amodal_silhouette(step.alone(entity).alphas[..., 0], step.seen_alone(entity)[1], hidden)
+
+    return _mean(one(entity) for entity in step.entities)
 
 
 def image_together(step: Step) -> Tensor:
-    return masked_l1(step.together.colors[..., :3], step.images, step.foreground)
+    return masked_l1(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
 
 
 def mse_together(step: Step) -> Tensor:
-    return masked_mse(step.together.colors[..., :3], step.images, step.foreground)
+    return masked_mse(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
 
 
 def ssim_together(step: Step) -> Tensor:
@@ -191,7 +96,8 @@ def ssim_together(step: Step) -> Tensor:
 
 
 def mask_together(step: Step) -> Tensor:
-    return outside_mask(step.together.colors[..., :3], step.foreground)
+    pixels = step.pixels
+    return outside_mask(pixels.colors[:, :3], pixels.foreground, pixels.n_outside)
 
 
 def mask_random_together(step: Step) -> Tensor:
@@ -210,26 +116,25 @@ def perceptual_together(step: Step) -> Tensor:
 
 
 def labels(step: Step) -> Tensor:
-    visible = torch.stack([step.share(entity) for entity in step.entities], dim=-1)
-    return label_difference(step.together.colors[..., 3:], visible)
+    return label_difference(step.pixels.colors[:, 3:], step.pixels.shares)
 
 
 def silhouette(step: Step) -> Tensor:
     """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
 
     def one(side: Side) -> Tensor:
-        scene, evidence = step.scene, step.evidence
+        scene, evidence, frames = step.scene, step.evidence, step.frames_of(side)
         posed = pose_hand(
             scene.hand_model(side),
             evidence.silhouettes[side],
             scene.hand_betas(side),
-            scene.hand_frames(side, step.frames),
+            scene.hand_frames(side, frames),
             side,
         )
-        hidden = evidence.targets.hidden(side)[step.frames]
-        return amodal_silhouette(step.render(posed).alphas[..., 0], step.share(side), hidden)
+        hidden = evidence.targets.hidden(side, frames)
+        return amodal_silhouette(step.render(posed).alphas[..., 0], step.seen_alone(side)[1], hidden)
 
-    return _mean(one(side) for side in step.scene.sides)
+    return _mean(one(side) for side in step.scene.sides if len(step.frames_of(side)))
 
 
 def color(step: Step) -> Tensor:

@@ -14,6 +14,8 @@ from toy_scenes import cube_scene
 
 from bigs.checks import InputError
 from bigs.hand import HandModel
+from bigs.losses.mask import label_difference, outside_mask
+from bigs.losses.photometric import masked_l1, masked_mse
 from bigs.models.hand_detail import free_hand
 from bigs.models.hand_splats import silhouette_hand
 from bigs.models.object_detail import split_object
@@ -23,8 +25,9 @@ from bigs.train.config import GraspStage, OptimizeStage
 from bigs.train.grasps import find_grasps
 from bigs.train.loop import StageProgress, StageState, choose_frames, run_stage, stage_entities
 from bigs.train.optim import GROUPS, group_parameters
+from bigs.train.step import Evidence, Step
 from bigs.train.targets import Targets
-from bigs.train.terms import IMAGE_TERMS, TERMS, Evidence
+from bigs.train.terms import IMAGE_TERMS, TERMS
 from bigs.types import Side
 
 FRAMES = 3
@@ -150,6 +153,50 @@ def test_every_group_can_be_reached_by_some_term(scene: Scene, evidence: Evidenc
     run_stage(scene, stage, evidence, 0)
     mine = [n for n, p in scene.named_parameters() if any(p is q for q in group_parameters(scene, group))]
     assert any(not torch.equal(dict(scene.named_parameters())[name], before[name]) for name in mine)
+
+
+def test_free_frames_alone_move(scene: Scene, evidence: Evidence) -> None:
+    """Each hand where it holds nothing; a hand that always holds is not looked at."""
+    scene.grasps["right"].of_frame.copy_(torch.tensor([0, 0, -1]))
+    scene.grasps["left"].of_frame.fill_(0)
+    lrs = {f"hand.{name}": 1e-3 for name in ("orient", "pose", "ray", "depth")}
+    weights = {"image": 1.0, "silhouette": 1.0, "acceleration": 1.0, "pose_prior": 1.0, "orient_prior": 1.0}
+    with torch.no_grad():  # so that priors and smoothness pull at every frame
+        for poses in scene.hand_poses.values():
+            for residual in (poses.orient, poses.pose, poses.position.ray):
+                residual.copy_(0.01 * torch.randn(residual.shape, generator=torch.Generator().manual_seed(3)))
+    before = values(scene)
+    stage = replace(ALONE, lrs=lrs, weights=weights, free_frames=True)
+    assert stage_entities(scene, stage) == ("right",)
+    run_stage(scene, stage, evidence, 0)
+    for name, now in scene.named_parameters():
+        if name.startswith("hand_poses.right.") and name.split(".", 2)[2] != "pose_bias":
+            assert torch.equal(now[:2], before[name][:2]), name
+            assert not torch.equal(now[2], before[name][2]), name
+        else:
+            assert torch.equal(now, before[name]), name
+
+
+def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evidence) -> None:
+    """Terms that look at each pixel for itself leave out those that are black and should be."""
+    targets = evidence.targets
+    shares = {entity: share * (torch.arange(40) < 25) for entity, share in targets.shares.items()}
+    evidence = replace(evidence, targets=replace(targets, shares=shares))
+    frames = torch.tensor([0, 2])
+    step = Step(scene, evidence, scene.entities, scene.canonical(scene.entities), frames)
+    assert 0 < len(step.pixels.colors) < 2 * 30 * 40
+    rendered, foreground = step.together.colors, evidence.targets.foreground(frames)
+    labels = torch.stack([shares[entity][frames] for entity in scene.entities], dim=-1)
+    images = targets.images[frames]
+    whole = {
+        "image": masked_l1(rendered[..., :3], images, foreground),
+        "mse": masked_mse(rendered[..., :3], images, foreground),
+        "mask": outside_mask(rendered[..., :3], foreground),
+        "labels": label_difference(rendered[..., 3:], labels),
+    }
+    for name, value in whole.items():
+        torch.testing.assert_close(IMAGE_TERMS["interacting-subjects"][name](step), value)
+        assert value > 0.0, name
 
 
 def test_skinning_and_scale_are_reached_too(scene: Scene, evidence: Evidence) -> None:

@@ -1,0 +1,157 @@
+"""One optimisation step: what it looks at, and renderings that are made when a term first asks for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bigs.losses.perceptual import VggWeights
+from bigs.models.hand_splats import CanonicalHand
+from bigs.models.object_splats import CanonicalObject
+from bigs.models.scene import Scene, concatenate
+from bigs.raster import rasterization
+from bigs.raster.settings import RasterSettings
+from bigs.train.targets import Targets
+from bigs.types import Entity, Gaussians, RenderOutput, Side
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a stage's terms look at besides the scene; fixed for the stage."""
+
+    targets: Targets
+    touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as is known
+    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands, of this resolution
+    contact: str  # "center" or "surface"
+    settings: RasterSettings
+    perceptual: VggWeights | None = None  # what the term "perceptual" needs
+
+
+class Pixels(NamedTuple):
+    """The M pixels of a joint rendering that count: all others show nothing and should."""
+
+    colors: Tensor  # [M, D] rendered
+    images: Tensor  # [M, 3]
+    foreground: Tensor  # [M]
+    shares: Tensor  # [M, E] for the entities rendered
+    n_outside: Tensor  # [] pixels of the whole images that show nothing
+
+
+@dataclass
+class Step:
+    """One optimisation step over some frames: holds the canonical Gaussians and what was made from them."""
+
+    scene: Scene
+    evidence: Evidence
+    entities: tuple[Entity, ...]  # rendered alone or together in this stage
+    canonical: dict[Entity, CanonicalHand | CanonicalObject]
+    frames: Tensor  # [B]
+    with_labels: bool = True  # whether the joint rendering has label channels
+    seed: int = 0  # of what the terms draw
+    free_frames: bool = False  # whether a hand alone is looked at where it holds nothing, instead of `frames`
+    _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        return tuple(e for e in self.entities if e != "object")
+
+    @cached_property
+    def everything(self) -> Tensor:
+        """All frames of the clip, for terms over time."""
+        return torch.arange(self.scene.n_frames)
+
+    def frames_of(self, entity: Entity) -> Tensor:
+        """The frames in which a subject is looked at alone."""
+        if self.free_frames and entity != "object":
+            return self.scene.free_frames(entity)
+        return self.frames
+
+    @cached_property
+    def images(self) -> Tensor:
+        return self.evidence.targets.images[self.frames]
+
+    @cached_property
+    def foreground(self) -> Tensor:
+        return self.evidence.targets.foreground(self.frames)
+
+    def share(self, entity: Entity) -> Tensor:
+        return self.evidence.targets.shares[entity][self.frames]
+
+    def seen_alone(self, entity: Entity) -> tuple[Tensor, Tensor]:
+        """Images and the subject's share of their pixels where it is looked at alone."""
+        targets, frames = self.evidence.targets, self.frames_of(entity)
+        return targets.images[frames], targets.shares[entity][frames]
+
+    def generator(self) -> torch.Generator:
+        """A fresh one for each term, so that what one term draws does not depend on the others."""
+        return torch.Generator().manual_seed(self.seed)
+
+    def render(self, gaussians: Gaussians) -> RenderOutput:
+        """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
+        targets = self.evidence.targets
+        out = rasterization(
+            *gaussians,
+            torch.eye(4)[None],
+            targets.K[None],
+            targets.width,
+            targets.height,
+            settings=self.evidence.settings,
+        )
+        return RenderOutput(out.colors[:, 0], out.alphas[:, 0], out.info)
+
+    def alone(self, entity: Entity) -> RenderOutput:
+        """One subject rendered without the others (the paper's single-subject step)."""
+        if entity not in self._alone:
+            frames = self.frames_of(entity)
+            self._alone[entity] = self.render(self.scene.posed(entity, self.canonical[entity], frames))
+        return self._alone[entity]
+
+    @cached_property
+    def together(self) -> RenderOutput:
+        """All subjects in one pass; after the three colours, one label channel per entity if labels count."""
+        labels = torch.eye(len(self.entities))
+        parts = []
+        for entity, label in zip(self.entities, labels, strict=True):
+            part = self.scene.posed(entity, self.canonical[entity], self.frames)
+            if self.with_labels:
+                channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
+                part = part._replace(colors=channels)
+            parts.append(part)
+        return self.render(concatenate(parts))
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        """For terms that look at each pixel for itself: hands and object fill a small part of an image."""
+        rendered, foreground = self.together, self.foreground
+        counts = (foreground > 0.0) | (rendered.alphas[..., 0] > 0.0)
+        index = torch.nonzero(counts.flatten()).flatten()
+
+        def some(values: Tensor) -> Tensor:
+            return values.flatten(0, 2).index_select(0, index)
+
+        shares = torch.stack([self.share(entity).flatten()[index] for entity in self.entities], dim=-1)
+        return Pixels(
+            some(rendered.colors), some(self.images), some(foreground), shares, (1.0 - foreground).sum()
+        )
+
+    @cached_property
+    def hands(self) -> dict[Side, tuple[Tensor, Tensor]]:
+        """Vertices and joints of every hand in every frame of the clip."""
+        return {side: self.scene.hand_points(side, self.everything) for side in self.scene.sides}
+
+    @cached_property
+    def object_distances(self) -> dict[Side, Tensor]:
+        """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
+        scale = self.scene.object_poses.log_scale.exp()
+        return {
+            side: scale * self.scene.object_distance(self.scene.in_object_frame(verts, self.everything))
+            for side, (verts, _) in self.hands.items()
+        }
+
+    @property
+    def has_object(self) -> bool:
+        return self.scene.object_splats is not None
