@@ -38,6 +38,11 @@ struct Sums<V, const K: usize> {
     absolutes: [V; ABSOLUTES],
 }
 
+#[inline(always)]
+fn absolute<V: Vector>(x: V) -> V {
+    x.max(V::splat(V::Scalar::ZERO).minus(x))
+}
+
 /// The rules of a render in vectors.
 struct Rules<V> {
     threshold: V,
@@ -88,8 +93,6 @@ impl<V: Vector, const K: usize> Sums<V, K> {
             self.v_values[k] = weight.times_plus(block.v_values[k].get(lane), self.v_values[k]);
         }
         if ABSOLUTE {
-            let zero = V::splat(V::Scalar::ZERO);
-            let absolute = |x: V| x.max(zero.minus(x));
             let along_y = V::splat(entry.w12).times_plus(hu, V::splat(entry.w22).times(hv));
             let [x, y] = self.absolutes;
             self.absolutes = [x.plus(absolute(hu)), y.plus(absolute(along_y))];

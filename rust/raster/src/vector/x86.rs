@@ -128,17 +128,17 @@ macro_rules! exp2_by_bits {
     };
 }
 
+/// The vector with this number, or zero.
+#[inline(always)]
+fn nth<V: Vector<Scalar = f32>, const N: usize>(vectors: &[V; N], i: usize) -> V {
+    if i < N { vectors[i] } else { V::splat(0.0) }
+}
+
 /// Four sums at once, each 128-bit part by itself: yields (a, b, c, d) in every part.
 macro_rules! fold4 {
-    ($v:expr, $first:expr, $n:expr, $lo:ident, $hi:ident, $lo2:ident, $hi2:ident, $add:ident, $zero:ident, $cast:ident, $back:ident) => {{
-        let at = |i: usize| {
-            if $first + i < $n {
-                $v[$first + i].0
-            } else {
-                op!($zero())
-            }
-        };
-        let (a, b, c, d) = (at(0), at(1), at(2), at(3));
+    ($v:expr, $first:expr, $lo:ident, $hi:ident, $lo2:ident, $hi2:ident, $add:ident, $cast:ident, $back:ident) => {{
+        let (a, b) = (nth($v, $first).0, nth($v, $first + 1).0);
+        let (c, d) = (nth($v, $first + 2).0, nth($v, $first + 3).0);
         op!({
             let ab = $add($lo(a, b), $hi(a, b));
             let cd = $add($lo(c, d), $hi(c, d));
@@ -235,13 +235,11 @@ impl Vector for F32x4 {
             let four = fold4!(
                 vectors,
                 first,
-                N,
                 _mm_unpacklo_ps,
                 _mm_unpackhi_ps,
                 _mm_unpacklo_pd,
                 _mm_unpackhi_pd,
                 _mm_add_ps,
-                _mm_setzero_ps,
                 _mm_castps_pd,
                 _mm_castpd_ps
             );
@@ -390,13 +388,11 @@ impl Vector for F32x8 {
             let parts = fold4!(
                 vectors,
                 first,
-                N,
                 _mm256_unpacklo_ps,
                 _mm256_unpackhi_ps,
                 _mm256_unpacklo_pd,
                 _mm256_unpackhi_pd,
                 _mm256_add_ps,
-                _mm256_setzero_ps,
                 _mm256_castps_pd,
                 _mm256_castpd_ps
             );
@@ -490,6 +486,51 @@ macro_rules! masks512 {
 #[allow(unreachable_pub)]
 pub struct F32x16(__m512);
 
+/// One vector of what is to be added and one of what it is to be added to: of two pieces that are added, a blend makes
+/// one, which runs where a shuffle, the scarce one, does not. Not closures: one that the compiler does not inline would
+/// be compiled without these instructions.
+impl F32x16 {
+    #[inline(always)]
+    fn by_8(self, other: Self) -> Self {
+        Self(op!(_mm512_add_ps(
+            _mm512_mask_blend_ps(0xFF00, self.0, other.0),
+            _mm512_shuffle_f32x4::<0b01_00_11_10>(self.0, other.0)
+        )))
+    }
+
+    #[inline(always)]
+    fn by_4(self, other: Self) -> Self {
+        Self(op!(_mm512_add_ps(
+            _mm512_mask_blend_ps(0xF0F0, self.0, other.0),
+            _mm512_permutex2var_ps(
+                self.0,
+                _mm512_setr_epi32(4, 5, 6, 7, 16, 17, 18, 19, 12, 13, 14, 15, 24, 25, 26, 27),
+                other.0
+            )
+        )))
+    }
+
+    #[inline(always)]
+    fn by_2(self, other: Self) -> Self {
+        Self(op!(_mm512_add_ps(
+            _mm512_mask_blend_ps(0xCCCC, self.0, other.0),
+            _mm512_shuffle_ps::<0b01_00_11_10>(self.0, other.0)
+        )))
+    }
+
+    #[inline(always)]
+    fn by_1(self, other: Self) -> Self {
+        Self(op!(_mm512_add_ps(
+            _mm512_mask_blend_ps(0xAAAA, self.0, other.0),
+            _mm512_permutex2var_ps(
+                self.0,
+                _mm512_setr_epi32(1, 16, 3, 18, 5, 20, 7, 22, 9, 24, 11, 26, 13, 28, 15, 30),
+                other.0
+            )
+        )))
+    }
+}
+
 impl Vector for F32x16 {
     common!(
         f32,
@@ -532,49 +573,19 @@ impl Vector for F32x16 {
     }
     #[inline(always)]
     fn sums<const N: usize>(vectors: &[Self; N]) -> [f32; MAX_SUMS] {
-        let at = |i: usize| {
-            if i < N {
-                vectors[i].0
-            } else {
-                op!(_mm512_setzero_ps())
-            }
-        };
-        // Two vectors become one, half as many lanes for each: of two pieces that are added, a blend makes one, which
-        // runs where a shuffle, the scarce one, does not.
-        let by_8 = |a, b| {
-            op!(_mm512_add_ps(
-                _mm512_mask_blend_ps(0xFF00, a, b),
-                _mm512_shuffle_f32x4::<0b01_00_11_10>(a, b)
-            ))
-        };
-        let by_4 = |a, b| {
-            let swapped = op!(_mm512_setr_epi32(
-                4, 5, 6, 7, 16, 17, 18, 19, 12, 13, 14, 15, 24, 25, 26, 27
-            ));
-            op!(_mm512_add_ps(
-                _mm512_mask_blend_ps(0xF0F0, a, b),
-                _mm512_permutex2var_ps(a, swapped, b)
-            ))
-        };
-        let by_2 = |a, b| {
-            op!(_mm512_add_ps(
-                _mm512_mask_blend_ps(0xCCCC, a, b),
-                _mm512_shuffle_ps::<0b01_00_11_10>(a, b)
-            ))
-        };
-        let by_1 = |a, b| {
-            let swapped = op!(_mm512_setr_epi32(
-                1, 16, 3, 18, 5, 20, 7, 22, 9, 24, 11, 26, 13, 28, 15, 30
-            ));
-            op!(_mm512_add_ps(
-                _mm512_mask_blend_ps(0xAAAA, a, b),
-                _mm512_permutex2var_ps(a, swapped, b)
-            ))
-        };
-        let two = |i: usize| by_8(at(i), at(i + 1));
-        let four = |i: usize| by_4(two(i), two(i + 2));
-        let eight = |i: usize| by_2(four(i), four(i + 4));
-        let all = by_1(eight(0), eight(8));
+        // Two vectors become one, half as many lanes for each, until one is left.
+        let mut pieces: [Self; MAX_SUMS] = [Self::splat(0.0); MAX_SUMS];
+        pieces[..N].copy_from_slice(vectors);
+        for i in 0..8 {
+            pieces[i] = pieces[2 * i].by_8(pieces[2 * i + 1]);
+        }
+        for i in 0..4 {
+            pieces[i] = pieces[2 * i].by_4(pieces[2 * i + 1]);
+        }
+        for i in 0..2 {
+            pieces[i] = pieces[2 * i].by_2(pieces[2 * i + 1]);
+        }
+        let all = pieces[0].by_1(pieces[1]).0;
         // Each vector's sum is now in the lane that its number, its four bits backwards, tells.
         let order = op!(_mm512_setr_epi32(
             0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15
