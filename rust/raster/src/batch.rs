@@ -3,14 +3,14 @@
 use rayon::prelude::*;
 
 use crate::camera::{Camera, CameraModel, Intrinsics};
-use crate::composite::Cotangents;
+use crate::composite_vjp::Cotangents;
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_finite, check_length};
 use crate::pool::{Buffers, Pooled, bytes_of};
 use crate::project::ScreenInfo;
 use crate::real::Real;
-use crate::render::{Image, View, ViewGradients, ViewState, render_view, render_view_vjp};
 use crate::settings::{Limits, RasterSettings, RenderMode};
+use crate::view::{Image, View, ViewGradients, ViewState, render_view, render_view_vjp};
 
 /// An input of a batch: `entries` × `cameras` slabs, where 1 along either axis means "shared".
 #[derive(Clone, Copy, Debug)]

@@ -85,7 +85,7 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         columns.set(lane, gaussians, first + lane);
     }
     let zero = [T::ZERO; CHUNK];
-    let [mut xs, mut ys, mut depths, mut opacities, mut reaches] = [zero; 5];
+    let [mut xs, mut ys, mut depths, mut log_opacities, mut reaches] = [zero; 5];
     let [mut w11s, mut w12s, mut w22s, mut rxs, mut rys] = [zero; 5];
     let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
     let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; CHUNK]; 5];
@@ -98,7 +98,7 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         let s = &o.splat;
         (xs[lane], ys[lane], depths[lane]) = (s.x, s.y, s.depth);
         (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
-        (opacities[lane], reaches[lane]) = (s.opacity, s.reach);
+        (log_opacities[lane], reaches[lane]) = (s.log_opacity, s.reach);
         [rxs[lane], rys[lane]] = o.radii;
         ceil_xs[lane] = o.radii[0].lesser(most).ceiling();
         ceil_ys[lane] = o.radii[1].lesser(most).ceiling();
@@ -143,7 +143,7 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
             w11: w11s[lane],
             w12: w12s[lane],
             w22: w22s[lane],
-            opacity: opacities[lane],
+            log_opacity: log_opacities[lane],
             reach: reaches[lane],
             depth,
         };

@@ -5,17 +5,22 @@
 //! and every build of it would spend seconds on them. So the stages are reached through these functions, which are
 //! not generic.
 
-use crate::composite::{Canvas, CompositeGradients, Cotangents, Scene, composite, composite_vjp, medians};
+use crate::binned::Binned;
+use crate::composite::{Canvas, composite};
+use crate::composite_vjp::{CompositeGradients, Cotangents, composite_vjp};
 use crate::error::RasterError;
 use crate::gaussians::first_not_finite;
-use crate::kernel::Channels;
+use crate::kernel::{Channels, Lanes};
+use crate::median::medians;
 use crate::pool::Pooled;
 use crate::project::ScreenInfo;
+use crate::project_vjp::project_view_vjp;
 use crate::real::Real;
-use crate::render::{Binned, View, ViewGradients, project_view_vjp};
+use crate::scene::Scene;
 use crate::settings::Limits;
 use crate::sh::{Harmonics, HarmonicsGradients};
 use crate::tiles::{BinScratch, TileGrid};
+use crate::view::{View, ViewGradients};
 
 /// The stages for a scalar.
 #[allow(unreachable_pub, missing_docs, private_interfaces)]
@@ -53,7 +58,7 @@ pub trait Compiled: Sized {
         limits: &Limits<Self>,
         binned: &Binned<Self>,
         channels: Channels<'_, Self>,
-        slots: &[Self],
+        slots: &[Lanes<Self>],
         out: ViewGradients<'_, Self>,
     );
     fn harmonics(harmonics: &Harmonics<'_, Self>) -> Vec<[Self; 3]>;
@@ -117,7 +122,7 @@ macro_rules! compiled {
                 limits: &Limits<Self>,
                 binned: &Binned<Self>,
                 channels: Channels<'_, Self>,
-                slots: &[Self],
+                slots: &[Lanes<Self>],
                 out: ViewGradients<'_, Self>,
             ) {
                 project_view_vjp(view, limits, binned, channels, slots, out);

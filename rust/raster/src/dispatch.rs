@@ -103,10 +103,10 @@ macro_rules! compiled_for {
             pub(super) fn backward<T: Real, const K: usize, const ABSOLUTE: bool>(
                 task: &TileTask<'_, T>,
                 pixels: &TileCotangents<'_, T>,
-                slots: &mut [T],
-                stride: usize,
+                slots: &mut [Lanes<T>],
+                width: usize,
             ) {
-                backward_tile::<<T as Vectors>::$Vector, K, ABSOLUTE>(task, pixels, slots, stride);
+                backward_tile::<<T as Vectors>::$Vector, K, ABSOLUTE>(task, pixels, slots, width);
             }
 
             #[target_feature(enable = $features)]
@@ -153,19 +153,19 @@ fn backward_level<T: Real, const K: usize, const ABSOLUTE: bool>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    slots: &mut [T],
-    stride: usize,
+    slots: &mut [Lanes<T>],
+    width: usize,
 ) {
     match level {
-        SimdLevel::Baseline => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, stride),
+        SimdLevel::Baseline => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, width),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, stride),
+        SimdLevel::Neon => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, width),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K, ABSOLUTE>(task, pixels, slots, stride) },
+        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K, ABSOLUTE>(task, pixels, slots, width) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K, ABSOLUTE>(task, pixels, slots, stride) },
+        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K, ABSOLUTE>(task, pixels, slots, width) },
     }
 }
 
@@ -191,18 +191,18 @@ pub(crate) fn backward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    slots: &mut [T],
-    stride: usize,
+    slots: &mut [Lanes<T>],
+    width: usize,
     absolute: bool,
 ) {
     match (task.channels.total - task.first, absolute) {
-        (1..=4, true) => backward_level::<T, 4, true>(level, task, pixels, slots, stride),
-        (_, true) => backward_level::<T, MAX_CHANNELS, true>(level, task, pixels, slots, stride),
-        (1, _) => backward_level::<T, 1, false>(level, task, pixels, slots, stride),
-        (2..=3, _) => backward_level::<T, 3, false>(level, task, pixels, slots, stride),
-        (4, _) => backward_level::<T, 4, false>(level, task, pixels, slots, stride),
-        (5..=6, _) => backward_level::<T, 6, false>(level, task, pixels, slots, stride),
-        _ => backward_level::<T, MAX_CHANNELS, false>(level, task, pixels, slots, stride),
+        (1..=4, true) => backward_level::<T, 4, true>(level, task, pixels, slots, width),
+        (_, true) => backward_level::<T, MAX_CHANNELS, true>(level, task, pixels, slots, width),
+        (1, _) => backward_level::<T, 1, false>(level, task, pixels, slots, width),
+        (2..=3, _) => backward_level::<T, 3, false>(level, task, pixels, slots, width),
+        (4, _) => backward_level::<T, 4, false>(level, task, pixels, slots, width),
+        (5..=6, _) => backward_level::<T, 6, false>(level, task, pixels, slots, width),
+        _ => backward_level::<T, MAX_CHANNELS, false>(level, task, pixels, slots, width),
     }
 }
 

@@ -1,10 +1,11 @@
-//! Compiles the loops of `chunk` once per CPU feature level and picks the best at run time, as `dispatch` does for the
+//! Compiles the loops of `chunk` and `gather` once per CPU feature level and picks the best at run time, as `dispatch` does for the
 //! compositor.
 //!
 //! The arithmetic is the same at every level, down to the bit: these loops fuse no multiplication with an addition.
 
 use crate::chunk::{ChunkGradients, ChunkSplats, project_chunk, vjp_chunk};
 use crate::dispatch::SimdLevel;
+use crate::gather::{ChunkSlots, ScreenGradients, gather_chunk};
 use crate::gaussians::Gaussians;
 use crate::project::Lens;
 use crate::real::Real;
@@ -26,6 +27,15 @@ macro_rules! compiled_for {
                 out: ChunkSplats<'_, T>,
             ) {
                 project_chunk::<T, ANTIALIASED>(gaussians, first, lens, grid, wanted, out);
+            }
+
+            #[target_feature(enable = $features)]
+            pub(super) fn gather<T: Real>(
+                from: &ChunkSlots<'_, T>,
+                out: ScreenGradients<'_, T>,
+                v: &mut ChunkGradients<T>,
+            ) {
+                gather_chunk(from, out, v);
             }
 
             #[target_feature(enable = $features)]
@@ -104,6 +114,25 @@ pub(crate) fn project<T: Real>(
         project_level::<T, true>(level, gaussians, first, lens, grid, wanted, out);
     } else {
         project_level::<T, false>(level, gaussians, first, lens, grid, wanted, out);
+    }
+}
+
+/// [`gather_chunk`] on this machine.
+#[allow(unsafe_code)]
+pub(crate) fn gather<T: Real>(
+    level: SimdLevel,
+    from: &ChunkSlots<'_, T>,
+    out: ScreenGradients<'_, T>,
+    v: &mut ChunkGradients<T>,
+) {
+    match level {
+        // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx2 => unsafe { avx2::gather(from, out, v) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        SimdLevel::Avx512 => unsafe { avx512::gather(from, out, v) },
+        _ => gather_chunk(from, out, v),
     }
 }
 

@@ -99,27 +99,35 @@
 )]
 
 mod batch;
+mod binned;
 mod camera;
 mod chunk;
 mod compiled;
 mod composite;
+mod composite_vjp;
 mod cov;
 mod dispatch;
 mod error;
+mod gather;
 mod gaussians;
 mod kernel;
 mod levels;
+mod median;
 pub mod peak;
 mod pool;
 mod project;
+mod project_vjp;
 mod real;
-mod render;
+mod renderer;
+mod scene;
 mod settings;
 mod sh;
+mod slots;
 mod sort;
 pub mod stages;
 mod tiles;
 mod vector;
+mod view;
 
 pub use batch::{
     Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs, Wanted,
@@ -129,7 +137,7 @@ pub use error::RasterError;
 pub use gaussians::Gaussians;
 pub use pool::release_memory;
 pub use real::Real;
-pub use render::{Frame, GaussianGrads, Renderer};
+pub use renderer::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};
 pub use sh::{Harmonics, HarmonicsGradients};
 pub use sort::{RadixKey, radix_sort};

@@ -17,6 +17,10 @@ const FRUSTUM_MARGIN: f64 = 0.3 * 0.5;
 /// Standard deviations between the image's corner and a centre at which numbers are about to end.
 const UNREACHABLE: f64 = 1e30;
 
+/// Opacities below this are composited as if they were this: a logarithm needs one above 0, and what the difference makes
+/// of an image is beyond either scalar's precision. Only reached without an alpha threshold.
+const FAINTEST: f64 = 1.0 / (1u64 << 63) as f64;
+
 /// A Gaussian on the screen.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Splat<T> {
@@ -25,8 +29,8 @@ pub(crate) struct Splat<T> {
     pub(crate) w11: T,
     pub(crate) w12: T,
     pub(crate) w22: T,
-    /// Opacity after compensation.
-    pub(crate) opacity: T,
+    /// log₂ of the opacity after compensation, or of [`FAINTEST`].
+    pub(crate) log_opacity: T,
     /// Alpha reaches the threshold where u² + v² ≤ `reach`.
     pub(crate) reach: T,
     /// Camera z.
@@ -181,8 +185,9 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     } else {
         opacity
     };
+    let log_opacity = opacity.greater(T::of(FAINTEST)).log2();
     let reach = if limits.alpha_threshold > T::ZERO {
-        opacity.greater(T::TINY).log2() - lens.log_threshold
+        log_opacity - lens.log_threshold
     } else {
         T::of(f64::INFINITY)
     };
@@ -203,7 +208,7 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
             w11: w.w11,
             w12: w.w12,
             w22: w.w22,
-            opacity,
+            log_opacity,
             reach,
             depth,
         },
@@ -215,7 +220,7 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     }
 }
 
-/// Gradients of a splat as the compositor sums them: over pixels, h = ∂loss/∂alpha · 2^−(u² + v²).
+/// Gradients of a splat as the compositor sums them: over pixels, h = ∂loss/∂alpha · alpha, where alpha is not limited.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SplatGradient<T> {
     /// Σ h
@@ -252,12 +257,17 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
     let w = whiten(shape.rows[0], shape.rows[1], eps);
     let compensation = if ANTIALIASED { w.compensation } else { T::ONE };
 
-    // alpha = opacity · 2^e, so the gradient of e is ln 2 · opacity · h; e = −(u² + v²).
-    let gain = T::of(std::f64::consts::LN_2) * opacity * compensation;
+    // alpha = opacity · 2^e, so the gradient of e is ln 2 · h; e = −(u² + v²).
+    let gain = T::of(std::f64::consts::LN_2);
+    let v_opacity = v.h / (opacity * compensation).greater(T::of(FAINTEST));
     let two = T::ONE + T::ONE;
     let v_x = two * gain * w.w11 * v.first[0];
     let v_y = two * gain * (w.w12 * v.first[0] + w.w22 * v.first[1]);
-    let v_compensation = if ANTIALIASED { Some(v.h * opacity) } else { None };
+    let v_compensation = if ANTIALIASED {
+        Some(v_opacity * opacity)
+    } else {
+        None
+    };
     let moments = three(|m| gain * v.second[m]);
     let (v_r0, v_r1) = whiten_vjp(shape.rows[0], shape.rows[1], eps, &w, moments, v_compensation);
 
@@ -298,7 +308,7 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
         mean: apply_transposed(&camera.rotation, v_point),
         quat: rotation_vjp(shape.unit_quat, shape.inverse_quat_length, &v_axes),
         scale: v_scale,
-        opacity: v.h * compensation,
+        opacity: v_opacity * compensation,
         viewmat: three(|r| [v_rotation[r][0], v_rotation[r][1], v_rotation[r][2], v_point[r]]),
     }
 }

@@ -2,16 +2,19 @@
 
 use rayon::prelude::*;
 
+use crate::binned::Binned;
 use crate::camera::Camera;
-use crate::composite::{Canvas, CompositeGradients, Cotangents};
+use crate::composite::Canvas;
+use crate::composite_vjp::{CompositeGradients, Cotangents};
 use crate::error::RasterError;
 use crate::gaussians::{Gaussians, check_length};
 use crate::pool::Pooled;
 use crate::project::ScreenInfo;
 use crate::real::Real;
-use crate::render::{Binned, GaussianGrads, View, scene};
+use crate::renderer::GaussianGrads;
 use crate::settings::{Limits, RasterSettings, RenderMode};
 use crate::tiles::{BinScratch, TileGrid};
+use crate::view::{View, scene};
 
 /// A view taken through the stages forward and back, each of which can be repeated.
 #[derive(Debug)]
@@ -144,7 +147,7 @@ impl<'a, T: Real> Stages<'a, T> {
             &self.limits,
             &self.binned,
             channels,
-            self.gradients.slots.values(),
+            self.gradients.slots.written(),
             grads.slices(),
         );
         grads
@@ -167,7 +170,7 @@ impl<'a, T: Real> Stages<'a, T> {
                 let dy = row as f64 + 0.5 - splat.y.as_f64();
                 let u = splat.w11.as_f64() * dx + splat.w12.as_f64() * dy;
                 let v = splat.w22.as_f64() * dy;
-                let alpha = (splat.opacity.as_f64() * (-(u * u + v * v)).exp2()).min(most);
+                let alpha = (splat.log_opacity.as_f64() - (u * u + v * v)).exp2().min(most);
                 if alpha < threshold {
                     continue;
                 }

@@ -129,6 +129,8 @@ impl<'a, T: Real> Cutter<'a, T> {
             e.right,
             e.half_height,
         ];
+        let (first, size) = (rows.start, T::of(self.grid.tile_size as f64));
+        let mut top = T::of((first * self.grid.tile_size as u32) as f64 + 0.5);
         for row in rows {
             if self.used == ROWS {
                 self.flush(cover);
@@ -137,7 +139,8 @@ impl<'a, T: Real> Cutter<'a, T> {
             for (column, value) in self.ellipses.iter_mut().zip(values) {
                 column[at] = value;
             }
-            self.tops[at] = T::of((row * self.grid.tile_size as u32) as f64 + 0.5);
+            self.tops[at] = top;
+            top += size;
             self.rows[at] = row * self.grid.columns as u32;
             self.owners[at] = owner as u32;
             self.used += 1;

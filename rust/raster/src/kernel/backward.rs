@@ -2,7 +2,7 @@
 
 use super::{
     ABSOLUTES, AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane,
-    TileTask, WORD, falloff,
+    TileTask, WORD,
 };
 use crate::real::Real;
 use crate::vector::{MAX_SUMS, Vector};
@@ -60,8 +60,7 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         rules: &Rules<V>,
     ) {
         let (u, v) = entry.whitened(block.x.get::<V>(lane), block.y.get(lane));
-        let falloff = falloff(u, v);
-        let raw = V::splat(entry.opacity).times(falloff);
+        let raw = entry.raw_alpha(u, v);
         let hit = V::both(
             block.end.get::<V>(lane).at_least(V::splat(entry.place)),
             raw.at_least(rules.threshold),
@@ -76,7 +75,7 @@ impl<V: Vector, const K: usize> Sums<V, K> {
             change = V::splat(entry.values[k]).times_plus(block.v_values[k].get(lane), change);
         }
         let free = V::both(hit, rules.max_alpha.at_least(raw));
-        let h = before.times(change).times(falloff).keep(free);
+        let h = before.times(change).times(raw).keep(free);
         block.transmittance.set(lane, before);
         block.behind.set(lane, alpha.times_plus(change, behind));
         let (hu, hv) = (h.times(u), h.times(v));
@@ -117,36 +116,41 @@ impl<V: Vector, const K: usize> Sums<V, K> {
 #[inline(always)]
 fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, T>,
-    slot: &mut [T],
+    slot: &mut [Lanes<T>],
     sums: &[T; MAX_SUMS],
 ) {
     let total = task.channels.total;
     if !ABSOLUTE && total == K && task.first == 0 {
-        // As the general case, with a length that the compiler knows: no calls to copy a few bytes.
-        slot[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
+        // As the general case: one store.
+        slot[0] = Lanes(*sums);
         return;
     }
     let used = (total - task.first).min(K);
-    let (moments, rest) = slot.split_at_mut(MOMENTS);
-    let (v_values, absolutes) = rest.split_at_mut(total);
-    v_values[task.first..][..used].copy_from_slice(&sums[MOMENTS..][..used]);
-    let kept = |sum: T| if task.first == 0 { T::ZERO } else { sum };
-    for (sum, &m) in moments.iter_mut().zip(sums) {
-        *sum = kept(*sum) + m;
+    let mut put = |place: usize, value: T, anew: bool| {
+        let old = &mut slot[place / LANES].0[place % LANES];
+        *old = if anew { value } else { *old + value };
+    };
+    for k in 0..MOMENTS {
+        put(k, sums[k], task.first == 0);
     }
-    for (sum, &a) in absolutes.iter_mut().zip(&sums[MOMENTS + K..]) {
-        *sum = kept(*sum) + a;
+    for k in 0..used {
+        put(MOMENTS + task.first + k, sums[MOMENTS + k], true);
+    }
+    if ABSOLUTE {
+        for k in 0..ABSOLUTES {
+            put(MOMENTS + total + k, sums[MOMENTS + K + k], task.first == 0);
+        }
     }
 }
 
-/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`stride` values
+/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`width` lines
 /// each: the moments, then all channels, then the absolutes if ABSOLUTE).
 #[inline(always)]
 pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
-    slots: &mut [V::Scalar],
-    stride: usize,
+    slots: &mut [Lanes<V::Scalar>],
+    width: usize,
 ) {
     let zero = V::Scalar::ZERO;
     let blocks = task.side * task.side;
@@ -214,7 +218,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
                 }
             }
             let mut rest = mask & active;
-            let slot = &mut slots[(batch + i) * stride..][..stride];
+            let slot = &mut slots[(batch + i) * width..][..width];
             if rest == 0 {
                 write::<V::Scalar, K, ABSOLUTE>(task, slot, &[zero; MAX_SUMS]);
                 continue;

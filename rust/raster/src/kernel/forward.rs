@@ -1,7 +1,7 @@
 //! One tile, front to back.
 
 use super::reach::BlockCentres;
-use super::{AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, WORD, falloff};
+use super::{AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, WORD};
 use crate::real::Real;
 use crate::vector::{Vector, transpose_bits};
 
@@ -45,7 +45,7 @@ impl<V: Vector, const K: usize> Light<V, K> {
     #[inline(always)]
     fn pass(&mut self, entry: &Entry<V::Scalar, K>, x: V, y: V, rules: &Rules<V>) {
         let (u, v) = entry.whitened(x, y);
-        let raw = V::splat(entry.opacity).times(falloff(u, v));
+        let raw = entry.raw_alpha(u, v);
         let hit = raw.at_least(rules.threshold);
         let alpha = raw.min(rules.max_alpha).keep(hit);
         let next = alpha.times_from(self.unstopped, self.unstopped);

@@ -1,6 +1,6 @@
 //! One tile, front to back, until half the light is gone.
 
-use super::{Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, falloff};
+use super::{Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask};
 use crate::real::Real;
 use crate::vector::Vector;
 
@@ -34,7 +34,7 @@ pub(crate) fn median_tile<V: Vector>(
             let mut dark = true;
             for lane in (0..LANES).step_by(V::LANES) {
                 let (u, v) = entry.whitened(centres.x[block].get::<V>(lane), centres.y[block].get(lane));
-                let raw = V::splat(entry.opacity).times(falloff(u, v));
+                let raw = entry.raw_alpha(u, v);
                 let hit = V::both(end[block].get::<V>(lane).at_least(place), raw.at_least(threshold));
                 let before = transmittance[block].get::<V>(lane);
                 let counts = V::both(hit, before.above(half));

@@ -31,7 +31,8 @@ pub(crate) const BLOCK: usize = 4;
 pub(crate) const MAX_SIDE: usize = 16;
 /// Most blocks in a tile.
 pub(crate) const MAX_BLOCKS: usize = 16;
-/// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv.
+/// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv, where h is the gradient of
+/// alpha times alpha.
 pub(crate) const MOMENTS: usize = 6;
 /// Gradient values after those of the channels where they are asked for: Σ |h u|, and Σ |h (w12 u + w22 v)|.
 pub(crate) const ABSOLUTES: usize = 2;
@@ -61,6 +62,12 @@ impl<T: Real> Lanes<T> {
     #[inline(always)]
     pub(crate) fn rows(&self) -> &[[T; BLOCK]] {
         self.0.as_chunks().0
+    }
+
+    /// By row of the block.
+    #[inline(always)]
+    pub(crate) fn rows_mut(&mut self) -> &mut [[T; BLOCK]] {
+        self.0.as_chunks_mut().0
     }
 
     #[inline(always)]
@@ -162,7 +169,7 @@ struct Entry<T, const K: usize> {
     u0: T,
     w22: T,
     v0: T,
-    opacity: T,
+    log_opacity: T,
     /// Place in the list as a number that compares as the place does.
     place: T,
     values: [T; K],
@@ -175,7 +182,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
         u0: T::ZERO,
         w22: T::ZERO,
         v0: T::ZERO,
-        opacity: T::ZERO,
+        log_opacity: T::ZERO,
         place: T::ZERO,
         values: [T::ZERO; K],
     };
@@ -205,7 +212,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
             u0: -(splat.w11 * x + splat.w12 * y),
             w22: splat.w22,
             v0: -(splat.w22 * y),
-            opacity: splat.opacity,
+            log_opacity: splat.log_opacity,
             place: T::ordinal(index as u32),
             values,
         }
@@ -219,12 +226,13 @@ impl<T: Real, const K: usize> Entry<T, K> {
             V::splat(self.w22).times_plus(y, V::splat(self.v0)),
         )
     }
-}
 
-/// 2^−(u² + v²)
-#[inline(always)]
-fn falloff<V: Vector>(u: V, v: V) -> V {
-    u.minus_times_minus(u, v.times(v)).exp2()
+    /// Alpha before it is limited: opacity · 2^−(u² + v²).
+    #[inline(always)]
+    fn raw_alpha<V: Vector<Scalar = T>>(&self, u: V, v: V) -> V {
+        let v2 = v.times_minus(v, V::splat(self.log_opacity));
+        u.minus_times_minus(u, v2).exp2()
+    }
 }
 
 /// Pixel centres of every block from the tile's anchor.

@@ -3,6 +3,7 @@
 use super::*;
 use crate::dispatch::{self, SimdLevel};
 use crate::settings::RasterSettings;
+use crate::slots::slot_width;
 use crate::vector::portable::Array;
 
 const SPLATS: usize = 150;
@@ -53,7 +54,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
                 w11: T::of(0.1 + 0.5 * uniform()),
                 w12: T::of(uniform() - 0.5),
                 w22: T::of(0.1 + 0.5 * uniform()),
-                opacity: T::of(opacity),
+                log_opacity: T::of(opacity.log2()),
                 reach: T::of((opacity / threshold).log2()),
                 depth: T::of(1.0 + i as f64),
             }
@@ -83,9 +84,9 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
     let mut transmittance = vec![Lanes::ZERO; blocks];
     let mut end = vec![Lanes::ZERO; blocks];
     let mut masks = vec![0; SPLATS];
-    let stride = MOMENTS + channels;
+    let width = slot_width(channels, false);
     // Slots are written, not added to.
-    let mut slots = vec![T::of(f64::NAN); SPLATS * stride];
+    let mut slots = vec![Lanes([T::of(f64::NAN); LANES]); SPLATS * width];
     while task.first < channels {
         let out = TileImage {
             colors: &mut planes[task.first * blocks..],
@@ -113,9 +114,9 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
             v_transmittance: &v_transmittance,
         };
         match runner {
-            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, stride, false),
+            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, width, false),
             Runner::Portable => {
-                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, stride);
+                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, width);
             }
         }
         task.first += MAX_CHANNELS;
@@ -126,7 +127,11 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         .flat_map(|lanes| &lanes.0);
     Outcome {
         image: image.map(|v| v.as_f64()).collect(),
-        slots: slots.iter().map(|v| v.as_f64()).collect(),
+        slots: slots
+            .chunks_exact(width)
+            .flat_map(|slot| slot.iter().flat_map(|line| line.0).take(MOMENTS + channels))
+            .map(|v| v.as_f64())
+            .collect(),
     }
 }
 
