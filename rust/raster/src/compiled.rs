@@ -10,7 +10,7 @@ use crate::composite::{Canvas, composite};
 use crate::composite_vjp::{CompositeGradients, Cotangents, composite_vjp};
 use crate::error::RasterError;
 use crate::gaussians::first_not_finite;
-use crate::kernel::{Channels, Lanes};
+use crate::kernel::Channels;
 use crate::median::medians;
 use crate::pool::Pooled;
 use crate::project::ScreenInfo;
@@ -58,7 +58,7 @@ pub trait Compiled: Sized {
         limits: &Limits<Self>,
         binned: &Binned<Self>,
         channels: Channels<'_, Self>,
-        slots: &[Lanes<Self>],
+        slots: &[Self],
         out: ViewGradients<'_, Self>,
     );
     fn harmonics(harmonics: &Harmonics<'_, Self>) -> Vec<[Self; 3]>;
@@ -122,7 +122,7 @@ macro_rules! compiled {
                 limits: &Limits<Self>,
                 binned: &Binned<Self>,
                 channels: Channels<'_, Self>,
-                slots: &[Lanes<Self>],
+                slots: &[Self],
                 out: ViewGradients<'_, Self>,
             ) {
                 project_view_vjp(view, limits, binned, channels, slots, out);

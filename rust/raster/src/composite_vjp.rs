@@ -6,11 +6,11 @@ use rayon::prelude::*;
 
 use crate::composite::{Canvas, LEAST_ALPHA, cut};
 use crate::dispatch::{self, SimdLevel};
-use crate::kernel::{BLOCK, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane};
+use crate::kernel::{BLOCK, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane};
 use crate::pool::Pooled;
 use crate::real::Real;
 use crate::scene::Scene;
-use crate::slots::{Slots, slot_width};
+use crate::slots::{Slots, slot_size};
 
 /// Gradients of an image.
 #[derive(Clone, Copy)]
@@ -29,11 +29,11 @@ pub(crate) struct CompositeGradients<T: Real> {
     pub(crate) tiles_skipped: usize,
 }
 
-/// Cuts a buffer into one piece per tile, `width` values per entry of the tile's list.
-fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], width: usize) -> Vec<&'a mut [U]> {
+/// Cuts a buffer into one piece per tile, `size` values per entry of the tile's list.
+fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], size: usize) -> Vec<&'a mut [U]> {
     offsets
         .windows(2)
-        .map(|pair| cut(&mut buffer, (pair[1] - pair[0]) as usize * width))
+        .map(|pair| cut(&mut buffer, (pair[1] - pair[0]) as usize * size))
         .collect()
 }
 
@@ -47,13 +47,13 @@ pub(crate) fn composite_vjp<T: Real>(
     let level = SimdLevel::detect();
     let blocks = scene.blocks();
     let total = scene.channels.total;
-    let width = slot_width(total, absolute);
+    let size = slot_size(total, absolute);
     let mut slots = Pooled::<Slots<T>>::take();
-    let lines = slots.lines(scene.bins.ranks.len() * width);
+    let values = slots.values(scene.bins.ranks.len() * size);
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     (
-        pieces_by_tile(lines, &scene.bins.offsets, width),
+        pieces_by_tile(values, &scene.bins.offsets, size),
         backgrounds.par_chunks_mut(total),
     )
         .into_par_iter()
@@ -74,7 +74,7 @@ pub(crate) fn composite_vjp<T: Real>(
                     }
                 }
                 if !any {
-                    clear(slots, width, task.first, total);
+                    clear(slots, size, task.first, total);
                 } else if !task.ranks.is_empty() {
                     skipped = false;
                     let cotangents = TileCotangents {
@@ -85,7 +85,7 @@ pub(crate) fn composite_vjp<T: Real>(
                         v_values: &incoming.v_values,
                         v_transmittance: &incoming.v_transmittance,
                     };
-                    dispatch::backward(level, &task, &cotangents, slots, width, absolute);
+                    dispatch::backward(level, &task, &cotangents, slots, size, absolute);
                 }
                 task.first += MAX_CHANNELS;
             }
@@ -107,15 +107,13 @@ pub(crate) fn composite_vjp<T: Real>(
 }
 
 /// Zeroes what a kernel would have written for the channels of the group that starts with `first`.
-fn clear<T: Real>(slots: &mut [Lanes<T>], width: usize, first: usize, total: usize) {
+fn clear<T: Real>(slots: &mut [T], size: usize, first: usize, total: usize) {
     if first == 0 {
-        slots.fill(Lanes::ZERO);
+        slots.fill(T::ZERO);
         return;
     }
-    for slot in slots.chunks_exact_mut(width) {
-        for place in MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS) {
-            slot[place / LANES].0[place % LANES] = T::ZERO;
-        }
+    for slot in slots.chunks_exact_mut(size) {
+        slot[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
     }
 }
 

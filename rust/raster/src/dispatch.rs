@@ -103,10 +103,10 @@ macro_rules! compiled_for {
             pub(super) fn backward<T: Real, const K: usize, const ABSOLUTE: bool>(
                 task: &TileTask<'_, T>,
                 pixels: &TileCotangents<'_, T>,
-                slots: &mut [Lanes<T>],
-                width: usize,
+                slots: &mut [T],
+                size: usize,
             ) {
-                backward_tile::<<T as Vectors>::$Vector, K, ABSOLUTE>(task, pixels, slots, width);
+                backward_tile::<<T as Vectors>::$Vector, K, ABSOLUTE>(task, pixels, slots, size);
             }
 
             #[target_feature(enable = $features)]
@@ -153,19 +153,19 @@ fn backward_level<T: Real, const K: usize, const ABSOLUTE: bool>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    slots: &mut [Lanes<T>],
-    width: usize,
+    slots: &mut [T],
+    size: usize,
 ) {
     match level {
-        SimdLevel::Baseline => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, width),
+        SimdLevel::Baseline => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, size),
         #[cfg(target_arch = "aarch64")]
-        SimdLevel::Neon => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, width),
+        SimdLevel::Neon => backward_tile::<T::Baseline, K, ABSOLUTE>(task, pixels, slots, size),
         // SAFETY: a level other than the baseline comes from `available`, which has detected its features.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K, ABSOLUTE>(task, pixels, slots, width) },
+        SimdLevel::Avx2 => unsafe { avx2::backward::<T, K, ABSOLUTE>(task, pixels, slots, size) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K, ABSOLUTE>(task, pixels, slots, width) },
+        SimdLevel::Avx512 => unsafe { avx512::backward::<T, K, ABSOLUTE>(task, pixels, slots, size) },
     }
 }
 
@@ -191,18 +191,18 @@ pub(crate) fn backward<T: Real>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    slots: &mut [Lanes<T>],
-    width: usize,
+    slots: &mut [T],
+    size: usize,
     absolute: bool,
 ) {
     match (task.channels.total - task.first, absolute) {
-        (1..=4, true) => backward_level::<T, 4, true>(level, task, pixels, slots, width),
-        (_, true) => backward_level::<T, MAX_CHANNELS, true>(level, task, pixels, slots, width),
-        (1, _) => backward_level::<T, 1, false>(level, task, pixels, slots, width),
-        (2..=3, _) => backward_level::<T, 3, false>(level, task, pixels, slots, width),
-        (4, _) => backward_level::<T, 4, false>(level, task, pixels, slots, width),
-        (5..=6, _) => backward_level::<T, 6, false>(level, task, pixels, slots, width),
-        _ => backward_level::<T, MAX_CHANNELS, false>(level, task, pixels, slots, width),
+        (1..=4, true) => backward_level::<T, 4, true>(level, task, pixels, slots, size),
+        (_, true) => backward_level::<T, MAX_CHANNELS, true>(level, task, pixels, slots, size),
+        (1, _) => backward_level::<T, 1, false>(level, task, pixels, slots, size),
+        (2..=3, _) => backward_level::<T, 3, false>(level, task, pixels, slots, size),
+        (4, _) => backward_level::<T, 4, false>(level, task, pixels, slots, size),
+        (5..=6, _) => backward_level::<T, 6, false>(level, task, pixels, slots, size),
+        _ => backward_level::<T, MAX_CHANNELS, false>(level, task, pixels, slots, size),
     }
 }
 

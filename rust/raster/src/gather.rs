@@ -1,10 +1,10 @@
 //! From the slots of (Gaussian, tile) pairs to the gradients of splats: sums in the order of the tiles.
 
 use crate::chunk::{ChunkGradients, is_sound};
-use crate::kernel::{ABSOLUTES, Channels, LANES, Lanes, MOMENTS};
+use crate::kernel::{ABSOLUTES, Channels, LANES, MOMENTS};
 use crate::project::Splat;
 use crate::real::Real;
-use crate::slots::slot_width;
+use crate::slots::slot_size;
 use crate::tiles::Cover;
 use crate::vector::prefetch;
 
@@ -14,7 +14,7 @@ const AHEAD: usize = 16;
 /// The slots of a chunk of Gaussians.
 pub(crate) struct ChunkSlots<'a, T> {
     /// Of all chunks.
-    pub(crate) lines: &'a [Lanes<T>],
+    pub(crate) values: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) absolute: bool,
     /// Of all chunks: see [`crate::tiles::TileBins::positions`].
@@ -41,14 +41,14 @@ struct Sums<T> {
 }
 
 impl<T: Real> ChunkSlots<'_, T> {
-    /// Sums a line of the slots at these positions.
+    /// Sums values `first..first + LANES` of the slots at these positions; more than a slot has mean nothing.
     #[inline(always)]
-    fn line(&self, positions: &[u32], width: usize, line: usize) -> Lanes<T> {
-        let mut sum = Lanes::ZERO;
+    fn vector(&self, positions: &[u32], size: usize, first: usize) -> [T; LANES] {
+        let mut sum = [T::ZERO; LANES];
         for &position in positions {
-            let own = &self.lines[position as usize * width + line];
+            let values = &self.values[position as usize * size + first..][..LANES];
             for k in 0..LANES {
-                sum.0[k] += own.0[k];
+                sum[k] += values[k];
             }
         }
         sum
@@ -56,28 +56,24 @@ impl<T: Real> ChunkSlots<'_, T> {
 
     /// Sums the slots of one Gaussian; writes the gradients of its colours to `colors` (none if empty).
     #[inline(always)]
-    fn sums(&self, positions: &[u32], width: usize, colors: &mut [T]) -> Sums<T> {
+    fn sums(&self, positions: &[u32], size: usize, colors: &mut [T]) -> Sums<T> {
         let Channels { total, colored, .. } = self.channels;
-        let first = self.line(positions, width, 0);
+        let values = self.vector(positions, size, 0);
         let mut sums = Sums {
-            moments: std::array::from_fn(|k| first.0[k]),
+            moments: std::array::from_fn(|k| values[k]),
             depth: T::ZERO,
             absolutes: [T::ZERO; ABSOLUTES],
         };
-        if width == 1 && colored == 3 && total == 3 && !self.absolute {
+        if colored == 3 && size == MOMENTS + 3 {
             // The usual case.
             if let Some(colors) = colors.first_chunk_mut::<3>() {
-                *colors = std::array::from_fn(|k| first.0[MOMENTS + k]);
+                *colors = std::array::from_fn(|k| values[MOMENTS + k]);
             }
             return sums;
         }
-        for line in 0..width {
-            let values = if line == 0 {
-                first
-            } else {
-                self.line(positions, width, line)
-            };
-            for (place, &value) in (line * LANES..).zip(&values.0) {
+        for first in (0..size).step_by(LANES) {
+            let values = self.vector(positions, size, first);
+            for (place, &value) in (first..size).zip(&values) {
                 let Some(channel) = place.checked_sub(MOMENTS) else {
                     continue;
                 };
@@ -87,7 +83,7 @@ impl<T: Real> ChunkSlots<'_, T> {
                     }
                 } else if channel < total {
                     sums.depth = value;
-                } else if self.absolute && channel < total + ABSOLUTES {
+                } else {
                     sums.absolutes[channel - total] = value;
                 }
             }
@@ -113,7 +109,7 @@ pub(crate) fn gather_chunk<T: Real>(
     out: ScreenGradients<'_, T>,
     v: &mut ChunkGradients<T>,
 ) {
-    let width = slot_width(from.channels.total, from.absolute);
+    let size = slot_size(from.channels.total, from.absolute);
     let Channels { stride, colored, .. } = from.channels;
     // alpha = opacity · 2^e, e = −(u² + v²).
     let gain = T::of(2.0 * std::f64::consts::LN_2);
@@ -125,14 +121,15 @@ pub(crate) fn gather_chunk<T: Real>(
         // Slots lie tile by tile: one Gaussian's, and the next one's, are far apart.
         let ahead = (own.start + AHEAD).min(from.positions.len());
         for &position in &from.positions[ahead..(ahead + own.len()).min(from.positions.len())] {
-            prefetch(from.lines, position as usize * width);
+            prefetch(from.values, position as usize * size);
+            prefetch(from.values, position as usize * size + size - 1);
         }
         let colors = if out.colors.is_empty() {
             &mut []
         } else {
             &mut out.colors[local * stride..][..colored]
         };
-        let sums = from.sums(&from.positions[own], width, colors);
+        let sums = from.sums(&from.positions[own], size, colors);
         let (splat, [h, mut hu, mut hv, huu, huv, hvv]) = (&from.splats[local], sums.moments);
         if let Some(v) = out.absgrad.get_mut(local) {
             let [x, y] = sums.absolutes;

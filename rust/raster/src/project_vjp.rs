@@ -6,7 +6,7 @@ use crate::binned::Binned;
 use crate::chunk::{CHUNK, ChunkGradients};
 use crate::dispatch::SimdLevel;
 use crate::gather::{ChunkSlots, ScreenGradients};
-use crate::kernel::{Channels, Lanes};
+use crate::kernel::Channels;
 use crate::levels;
 use crate::project::Lens;
 use crate::real::Real;
@@ -28,7 +28,7 @@ pub(crate) fn project_view_vjp<T: Real>(
     limits: &Limits<T>,
     binned: &Binned<T>,
     channels: Channels<'_, T>,
-    slots: &[Lanes<T>],
+    slots: &[T],
     out: ViewGradients<'_, T>,
 ) {
     let (stride, colored) = (channels.stride, channels.colored);
@@ -61,7 +61,7 @@ pub(crate) fn project_view_vjp<T: Real>(
             |(chunk, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
                 let first = chunk * CHUNK;
                 let from = ChunkSlots {
-                    lines: slots,
+                    values: slots,
                     channels,
                     absolute,
                     positions: &binned.bins.positions,

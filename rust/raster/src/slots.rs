@@ -1,12 +1,13 @@
 //! What the compositor's vjp finds for each pair of tile and Gaussian.
 
-use crate::kernel::{ABSOLUTES, LANES, Lanes, MOMENTS};
+use crate::kernel::{ABSOLUTES, LANES, MOMENTS};
 use crate::pool::{Buffers, bytes_of, stale};
+use crate::real::Real;
 
-/// A slot per entry of [`crate::tiles::TileBins::ranks`], in whole cache lines (f32), since slots are read in another
-/// order than they are written: `MOMENTS`, then channels, then `ABSOLUTES` if asked for.
+/// A slot per entry of [`crate::tiles::TileBins::ranks`]: `MOMENTS`, then channels, then `ABSOLUTES` if asked for. Packed:
+/// slots are read in another order than they are written, so what counts is how many fit into the caches.
 #[derive(Debug)]
-pub(crate) struct Slots<T>(Vec<Lanes<T>>);
+pub(crate) struct Slots<T>(Vec<T>);
 
 impl<T> Default for Slots<T> {
     fn default() -> Self {
@@ -14,30 +15,24 @@ impl<T> Default for Slots<T> {
     }
 }
 
-impl<T> Buffers for Slots<T>
-where
-    Self: Send + 'static,
-{
+impl<T: Real> Buffers for Slots<T> {
     fn bytes(&self) -> usize {
         bytes_of(&self.0)
     }
 }
 
-impl<T: Copy + Default> Slots<T>
-where
-    Lanes<T>: Copy + Default,
-{
-    /// So many lines to be written.
-    pub(crate) fn lines(&mut self, count: usize) -> &mut [Lanes<T>] {
-        stale(&mut self.0, count)
-    }
-
-    pub(crate) fn written(&self) -> &[Lanes<T>] {
-        &self.0
-    }
+/// Values of a slot with so many channels.
+pub(crate) fn slot_size(channels: usize, absolute: bool) -> usize {
+    MOMENTS + channels + if absolute { ABSOLUTES } else { 0 }
 }
 
-/// Lines of a slot with so many channels.
-pub(crate) fn slot_width(channels: usize, absolute: bool) -> usize {
-    (MOMENTS + channels + if absolute { ABSOLUTES } else { 0 }).div_ceil(LANES)
+impl<T: Real> Slots<T> {
+    /// So many values to be written; behind them lie enough others that a whole vector can be read from each.
+    pub(crate) fn values(&mut self, count: usize) -> &mut [T] {
+        &mut stale(&mut self.0, count + LANES)[..count]
+    }
+
+    pub(crate) fn written(&self) -> &[T] {
+        &self.0
+    }
 }

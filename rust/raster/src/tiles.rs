@@ -87,9 +87,6 @@ pub(crate) struct Cutter<'a, T> {
     /// Tiles that are wanted; all if absent.
     wanted: Option<&'a [bool]>,
     ellipses: [Column<T>; 8],
-    /// Height of each row's first pixel centres.
-    tops: Column<T>,
-    /// First tile of each row.
     rows: Column<u32>,
     /// Whose row it is.
     owners: Column<u32>,
@@ -102,7 +99,6 @@ impl<'a, T: Real> Cutter<'a, T> {
             grid,
             wanted,
             ellipses: [[T::ZERO; ROWS]; 8],
-            tops: [T::ZERO; ROWS],
             rows: [0; ROWS],
             owners: [0; ROWS],
             used: 0,
@@ -129,8 +125,6 @@ impl<'a, T: Real> Cutter<'a, T> {
             e.right,
             e.half_height,
         ];
-        let (first, size) = (rows.start, T::of(self.grid.tile_size as f64));
-        let mut top = T::of((first * self.grid.tile_size as u32) as f64 + 0.5);
         for row in rows {
             if self.used == ROWS {
                 self.flush(cover);
@@ -139,9 +133,7 @@ impl<'a, T: Real> Cutter<'a, T> {
             for (column, value) in self.ellipses.iter_mut().zip(values) {
                 column[at] = value;
             }
-            self.tops[at] = top;
-            top += size;
-            self.rows[at] = row * self.grid.columns as u32;
+            self.rows[at] = row;
             self.owners[at] = owner as u32;
             self.used += 1;
         }
@@ -155,10 +147,12 @@ impl<'a, T: Real> Cutter<'a, T> {
         let width = T::of(self.grid.width as f64);
         // Tile sizes are powers of two; a division would cost more than all the rest.
         let shift = self.grid.tile_size.trailing_zeros();
+        let columns = self.grid.columns as u32;
         let [xs, ys, reaches, w22s, inverses, slopes, rights, half_heights] = &self.ellipses;
         for i in 0..ROWS {
             let (reach, w22, inverse_w11) = (reaches[i], w22s[i], inverses[i]);
-            let top = self.tops[i] - ys[i];
+            // From the row's first pixel centres.
+            let top = T::of(f64::from(self.rows[i] << shift) + 0.5) - ys[i];
             let low = top.greater(-half_heights[i]);
             let high = (top + tall).lesser(half_heights[i]);
             let half_width = |dy: T| {
@@ -170,7 +164,7 @@ impl<'a, T: Real> Cutter<'a, T> {
             let left = xs[i] + slopes[i] * left_at - half_width(left_at);
             let right = xs[i] + slopes[i] * right_at + half_width(right_at);
             let (first, past) = pixel_range(left, right, width);
-            firsts[i] = self.rows[i] + (first >> shift);
+            firsts[i] = self.rows[i] * columns + (first >> shift);
             let count = (past.wrapping_sub(1) >> shift)
                 .wrapping_sub(first >> shift)
                 .wrapping_add(1);

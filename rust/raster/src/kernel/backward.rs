@@ -116,19 +116,18 @@ impl<V: Vector, const K: usize> Sums<V, K> {
 #[inline(always)]
 fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, T>,
-    slot: &mut [Lanes<T>],
+    slot: &mut [T],
     sums: &[T; MAX_SUMS],
 ) {
     let total = task.channels.total;
     if !ABSOLUTE && total == K && task.first == 0 {
-        // As the general case: one store.
-        slot[0] = Lanes(*sums);
+        // As the general case, with a length that the compiler knows: no calls to copy a few bytes.
+        slot[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
         return;
     }
     let used = (total - task.first).min(K);
     let mut put = |place: usize, value: T, anew: bool| {
-        let old = &mut slot[place / LANES].0[place % LANES];
-        *old = if anew { value } else { *old + value };
+        slot[place] = if anew { value } else { slot[place] + value };
     };
     for k in 0..MOMENTS {
         put(k, sums[k], task.first == 0);
@@ -143,14 +142,14 @@ fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     }
 }
 
-/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`width` lines
+/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`size` values
 /// each: the moments, then all channels, then the absolutes if ABSOLUTE).
 #[inline(always)]
 pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
-    slots: &mut [Lanes<V::Scalar>],
-    width: usize,
+    slots: &mut [V::Scalar],
+    size: usize,
 ) {
     let zero = V::Scalar::ZERO;
     let blocks = task.side * task.side;
@@ -218,7 +217,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
                 }
             }
             let mut rest = mask & active;
-            let slot = &mut slots[(batch + i) * width..][..width];
+            let slot = &mut slots[(batch + i) * size..][..size];
             if rest == 0 {
                 write::<V::Scalar, K, ABSOLUTE>(task, slot, &[zero; MAX_SUMS]);
                 continue;

@@ -3,7 +3,7 @@
 use super::*;
 use crate::dispatch::{self, SimdLevel};
 use crate::settings::RasterSettings;
-use crate::slots::slot_width;
+use crate::slots::slot_size;
 use crate::vector::portable::Array;
 
 const SPLATS: usize = 150;
@@ -84,9 +84,9 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
     let mut transmittance = vec![Lanes::ZERO; blocks];
     let mut end = vec![Lanes::ZERO; blocks];
     let mut masks = vec![0; SPLATS];
-    let width = slot_width(channels, false);
+    let size = slot_size(channels, false);
     // Slots are written, not added to.
-    let mut slots = vec![Lanes([T::of(f64::NAN); LANES]); SPLATS * width];
+    let mut slots = vec![T::of(f64::NAN); SPLATS * size];
     while task.first < channels {
         let out = TileImage {
             colors: &mut planes[task.first * blocks..],
@@ -114,9 +114,9 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
             v_transmittance: &v_transmittance,
         };
         match runner {
-            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, width, false),
+            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, size, false),
             Runner::Portable => {
-                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, width);
+                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, size);
             }
         }
         task.first += MAX_CHANNELS;
@@ -127,11 +127,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         .flat_map(|lanes| &lanes.0);
     Outcome {
         image: image.map(|v| v.as_f64()).collect(),
-        slots: slots
-            .chunks_exact(width)
-            .flat_map(|slot| slot.iter().flat_map(|line| line.0).take(MOMENTS + channels))
-            .map(|v| v.as_f64())
-            .collect(),
+        slots: slots.iter().map(|v| v.as_f64()).collect(),
     }
 }
 
