@@ -18,6 +18,9 @@ from bigs.raster import RasterSettings, rasterization
 Region = Literal["whole", "centre"]
 OURS = "bigs"
 
+# Between the first and the last of several cameras, metres.
+_BASELINE = 0.06
+
 
 @dataclass(frozen=True)
 class Task:
@@ -30,6 +33,8 @@ class Task:
     wanted: tuple[str, ...] = PARAMETERS  # gradients
     rendered: Region = "whole"  # centre: the pixel mask keeps the middle quarter of the image
     differentiated: Region = "whole"  # centre: no gradient comes in outside the middle quarter
+    views: int = 1  # cameras side by side
+    apart: bool = False  # render them one by one
     unseen: float = 0.0  # Gaussians added that no pixel sees, as a part of those there are
 
 
@@ -47,10 +52,12 @@ class Call:
             name: torch.tensor(gaussians[name], dtype=dtype, requires_grad=name in task.wanted)
             for name in PARAMETERS
         }
-        self._viewmat = torch.tensor(workload.viewmat, dtype=dtype)
+        # As far apart as a pair of eyes.
+        self._viewmats = torch.tensor(workload.viewmat, dtype=dtype).repeat(task.views, 1, 1)
+        self._viewmats[:, 0, 3] += torch.linspace(0, _BASELINE, task.views, dtype=dtype)
         self._K = torch.tensor(workload.K, dtype=dtype)
         self._size = (workload.width, workload.height)
-        self._settings = task.settings
+        self._settings, self._apart = task.settings, task.apart
         self.weights = torch.tensor(workload.weights, dtype=dtype)
         if task.differentiated == "centre":
             self.weights = self.weights * centre_mask(*self._size)[..., None]
@@ -59,19 +66,26 @@ class Call:
     def engine_times(self) -> list[tuple[str, float]]:
         """Wall milliseconds of the engine's stages and whole calls on the same arrays, without torch."""
         gaussians = [leaf.detach().numpy() for leaf in self.leaves.values()]
-        camera = [self._viewmat.numpy(), self._K.numpy()]
+        camera = [self._viewmats[0].numpy(), self._K.numpy()]
         seconds = _raster.time_engine(gaussians, camera, *self._size, self._settings, self.weights.numpy())
         return [(name, 1e3 * value) for name, value in seconds]
 
     def forward(self) -> torch.Tensor:
-        """The image [H, W, 3]; `info` becomes what the renderer told about it."""
-        image, self.info = self._render(self.leaves, self._viewmat, self._K, *self._size)
-        return image
+        """The image [H, W, 3], of several views [views, H, W, 3]; `info` becomes what was told about it."""
+        if not self._apart:
+            viewmats = self._viewmats[0] if len(self._viewmats) == 1 else self._viewmats
+            image, self.info = self._render(self.leaves, viewmats, self._K, *self._size)
+            return image
+        images = []
+        for viewmat in self._viewmats:
+            image, self.info = self._render(self.leaves, viewmat, self._K, *self._size)
+            images.append(image)
+        return torch.stack(images)
 
     def backward(self, image: torch.Tensor) -> dict[str, np.ndarray]:
         """Gradients of sum(image · weights) for the wanted arrays."""
         wanted = {name: leaf for name, leaf in self.leaves.items() if leaf.requires_grad}
-        found = torch.autograd.grad(image, list(wanted.values()), self.weights)
+        found = torch.autograd.grad(image, list(wanted.values()), self.weights.expand_as(image))
         return {name: gradient.numpy() for name, gradient in zip(wanted, found, strict=True)}
 
 
@@ -104,22 +118,24 @@ def _with_unseen(workload: Workload, part: float) -> dict[str, np.ndarray]:
 def _bigs_renderer(task: Task, workload: Workload) -> Render:
     mask = centre_mask(workload.width, workload.height)[None] if task.rendered == "centre" else None
 
+    # Of one view, or [views, 4, 4].
     def render(
         leaves: dict[str, torch.Tensor], viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int
     ) -> tuple[torch.Tensor, dict[str, Any]]:
+        viewmats = viewmat.reshape(-1, 4, 4)
         output = rasterization(
             leaves["means"],
             leaves["quats"],
             leaves["scales"],
             leaves["opacities"],
             leaves["colors"],
-            viewmat[None],
-            K[None],
+            viewmats,
+            K.expand(len(viewmats), 3, 3),
             width,
             height,
             settings=task.settings,
             pixel_mask=mask,
         )
-        return output.colors[0], output.info
+        return (output.colors if viewmat.ndim == 3 else output.colors[0]), output.info
 
     return render

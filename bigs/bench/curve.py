@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bigs.bench.calls import Task
-from bigs.raster import RasterSettings
 
 # What stands for a renderer without thresholds: every pair of which a float32 image could show anything. With
 # exactly 0 every Gaussian would cover every pixel.
@@ -40,11 +39,6 @@ SETTINGS: tuple[Point, ...] = (
     ),
     *_points("min_transmittance", {"0": 0.0, "1e-5": 1e-5, "1e-4": 1e-4, "1e-3": 1e-3, "1e-2": 1e-2}),
     *_points("tile_size", {"4": 4, "8": 8, "16": 16}),
-    *(
-        _points("exp_degree", {str(degree): degree for degree in (3, 4, 5)})
-        if "exp_degree" in {field.name for field in fields(RasterSettings)}
-        else ()
-    ),
     *_points("dtype", {"float32": "float32", "float64": "float64"}),
 )
 

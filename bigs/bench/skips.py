@@ -33,6 +33,11 @@ SKIPS: tuple[Skip, ...] = (
         _same,
         lambda base: replace(base, settings=replace(base.settings, min_transmittance=0.0)),
     ),
+    Skip(
+        "8 cameras in one call",
+        lambda base: replace(base, views=8),
+        lambda base: replace(base, views=8, apart=True),
+    ),
     # Without culling each Gaussian would cost what a seen one does; that can be computed but not switched on.
     Skip("as many Gaussians again, unseen", lambda base: replace(base, unseen=1.0), work=2.0),
 )

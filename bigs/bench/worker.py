@@ -119,15 +119,14 @@ def counters(task: Task) -> dict[str, int]:
     """What the renderer counted in a forward and a backward pass."""
     call = _call(task)
     call.backward(call.forward())
-    return {
-        name: value for name, value in call.info.items() if name.startswith("n_") and isinstance(value, int)
-    }
+    found = {name: n for name, n in call.info.items() if name.startswith("n_") and isinstance(n, int)}
+    return {**found, "gradients_skipped": len(call.info["gradients_skipped"])}
 
 
-def errors(task: Task, *truths: Task) -> list[dict[str, float]]:
+def errors(task: Task, *truths: Task, leave_out: int = 0) -> list[dict[str, float]]:
     """Relative errors of one task against each of several others."""
     found = _fresh_result(task)
-    return [relative_errors(_result(truth), found) for truth in truths]
+    return [relative_errors(_result(truth), found, leave_out) for truth in truths]
 
 
 def errors_against(task: Task, truth: dict[str, np.ndarray]) -> dict[str, float]:

@@ -10,6 +10,7 @@ import typing
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import Answer, assert_refused
 
@@ -18,6 +19,7 @@ from bigs.bench import worker
 from bigs.bench.calls import Call, Task, centre_mask
 from bigs.bench.curve import SETTINGS, every_pair
 from bigs.bench.engine import variants
+from bigs.bench.errors import relative_errors
 from bigs.bench.machine import free_memory, peak_of
 from bigs.bench.peers import PEERS
 from bigs.bench.plan import PARTS, Plan
@@ -109,8 +111,9 @@ def test_what_is_left_out_leaves_the_image_alone(skip) -> None:
     """Where both sides show a pixel they show the same, but for what lies behind a stop."""
     base = Task(WorkloadSpec("D", scale=0.02))
     images = [Call(make(base)).forward().detach() for make in (skip.with_it, skip.without_it)]
-    inside = centre_mask(*images[0].shape[1::-1])
-    assert float((images[0] - images[1])[inside].abs().max()) < 1e-3
+    height, width = images[0].shape[-3:-1]
+    inside = centre_mask(width, height)
+    assert float((images[0] - images[1])[..., inside, :].abs().max()) < 1e-3
 
 
 def test_unseen_gaussians_are_unseen() -> None:
@@ -171,3 +174,13 @@ def test_a_small_run_writes_what_it_prints(call: Callable[..., Answer], tmp_path
         assert len(workload["curve"]) == len(SETTINGS)
         assert len(workload["skips"]) == len(SKIPS)
     assert (out / "engine.png").stat().st_size > 5_000
+
+
+def test_the_worst_are_left_out_of_an_error_and_no_others() -> None:
+    truth = {"means": np.ones((4, 3)), "opacities": np.full(4, 2.0)}
+    found = {name: array.copy() for name, array in truth.items()}
+    found["means"][2] += 5.0
+    found["opacities"][1:3] += [3.0, 1.0]
+    assert relative_errors(truth, found)["means"] == pytest.approx(5.0 / 2)
+    without = relative_errors(truth, found, leave_out=1)
+    assert without == pytest.approx({"means": 0.0, "opacities": 1 / 4})

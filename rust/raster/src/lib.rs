@@ -99,6 +99,7 @@
 )]
 
 mod batch;
+mod batch_vjp;
 mod binned;
 mod camera;
 mod chunk;
@@ -122,6 +123,8 @@ mod renderer;
 mod scene;
 mod settings;
 mod sh;
+mod sh_basis;
+mod slabs;
 mod slots;
 mod sort;
 pub mod stages;
@@ -129,9 +132,8 @@ mod tiles;
 mod vector;
 mod view;
 
-pub use batch::{
-    Batch, BatchGradients, BatchImages, BatchInputs, BatchShape, BatchState, Counters, Slabs, Wanted,
-};
+pub use batch::{Batch, BatchImages, BatchState, Counters};
+pub use batch_vjp::{BatchGradients, Wanted};
 pub use camera::{Camera, CameraModel, Intrinsics};
 pub use error::RasterError;
 pub use gaussians::Gaussians;
@@ -140,6 +142,7 @@ pub use real::Real;
 pub use renderer::{Frame, GaussianGrads, Renderer};
 pub use settings::{RasterSettings, RenderMode};
 pub use sh::{Harmonics, HarmonicsGradients};
+pub use slabs::{BatchInputs, BatchShape, Slabs};
 pub use sort::{RadixKey, radix_sort};
 
 /// The README's code is compiled and run with the documentation's.
