@@ -139,7 +139,7 @@ mod tests {
         assert!(along_y[1] < 0.0 && along_z[2] > 0.0 && along_x[3] < 0.0);
         assert!(along_z[6] > 0.0 && along_x[8] > 0.0 && along_z[12] > 0.0);
         assert!(along_y[9] > 0.0 && along_x[15] < 0.0 && along_x[13] > 0.0);
-        let diagonal = basis::<f64, 16>(unit([1.0, 1.0, 1.0]).0);
+        let diagonal = basis::<f64, 16>([1.0 / 3f64.sqrt(); 3]);
         assert!(diagonal[4] > 0.0 && diagonal[5] < 0.0 && diagonal[7] < 0.0 && diagonal[10] > 0.0);
     }
 }
