@@ -1,5 +1,4 @@
 //! AVX2 with FMA.
-#![allow(unsafe_code)]
 
 use std::arch::x86_64::*;
 

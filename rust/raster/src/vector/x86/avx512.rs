@@ -1,5 +1,4 @@
 //! AVX-512.
-#![allow(unsafe_code)]
 
 use std::arch::x86_64::*;
 

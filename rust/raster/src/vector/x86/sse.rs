@@ -1,5 +1,4 @@
 //! SSE2, which every x86-64 has.
-#![allow(unsafe_code)]
 
 use std::arch::x86_64::*;
 
