@@ -42,7 +42,11 @@ COMMANDS: Commands = {
     "batch": batch.batch,
     "ablate": runs.ablate,
     "prior": {"fit": prior.prior_fit, "train": prior.prior_train},
-    "bench": {"engine": bench.bench_engine, "reconstruct": bench.bench_reconstruct},
+    "bench": {
+        "engine": bench.bench_engine,
+        "preprocess": bench.bench_preprocess,
+        "reconstruct": bench.bench_reconstruct,
+    },
 }
 # What the help says of commands that have commands of their own.
 GROUPS = {

@@ -95,3 +95,33 @@ def bench_reconstruct(
         found = run(plan, out, picture=picture, listen=status.update)
     print_tables([table for table in found.tables if table.title in BRIEF], out)
     fail_for(found.failed)
+
+
+def bench_preprocess(
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("bench"),
+    variants: tuple[str, ...] = (),
+    hand_model: Path | None = None,
+    seed: int = 0,
+    threads: int = 0,
+) -> None:
+    """Preprocess clips from their pictures, masks and simulated keypoints, as they are and made harder.
+
+    Args:
+        clips: clips with gt.npz, which scores the outcome and simulates the keypoints.
+        out: folder for the clips made, preprocess.md and preprocess.json.
+        variants: which of the harder variants; all if not given.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        seed: of the noise.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.bench_preprocess import PreprocessPlan
+    from bigs.commands.bench_preprocess import bench_preprocess as run
+    from bigs.commands.preprocess_variants import VARIANTS
+
+    plan = PreprocessPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
+    with stderr.status("starting") as status:
+        found = run(plan, out, status.update)
+    print_tables(found.tables, out)
+    fail_for(found.failed)

@@ -131,7 +131,7 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
         InputError: a missing or damaged file or field, a name that is no number, or no annotated frame.
     """
     where, meta = _subject_meta(view)
-    sizes = array_field(f"{where}.image_size", require(f"{where}.image_size", meta, "image_size"), (9, 2))
+    sizes = _image_sizes(where, meta)
     hands_file = view.raw("mano")
     stored = mapping_field(str(hands_file), load_npy(hands_file))
     where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
@@ -159,6 +159,43 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
         },
         object=_read_object(view, n_rows, rows, valid),
     )
+
+
+def meta_of_images(folder: Path) -> Path | None:
+    """`ROOT/meta/misc.json` for a folder ROOT/images/SUBJECT/SEQUENCE/VIEW of whole images by a still camera.
+
+    None for any other folder, or where the release's `meta` was not downloaded.
+    """
+    parts = folder.absolute().parts
+    if len(parts) < 5 or parts[-4] != "images" or parts[-1] not in "12345678":
+        return None
+    file = Path(*parts[:-4]) / "meta" / "misc.json"
+    return file if file.is_file() else None
+
+
+def camera_of_images(folder: Path) -> tuple[np.ndarray, tuple[int, int]] | None:
+    """K [3, 3] of a folder of ARCTIC's images, and the width and height that it belongs to.
+
+    Needs no annotation. None where `meta_of_images` finds nothing.
+
+    Raises:
+        InputError: the file does not have the subject or its cameras.
+    """
+    file = meta_of_images(folder)
+    if file is None:
+        return None
+    subject, sequence, view = folder.absolute().parts[-3:]
+    where, meta = _subject_meta(ArcticView(file.parent.parent, subject, sequence, int(view)))
+    width, height = _image_sizes(where, meta)[int(view)]
+    return _intrinsics(where, meta)[int(view) - 1], (int(width), int(height))
+
+
+def _image_sizes(where: str, meta: Mapping[str, Any]) -> np.ndarray:
+    return array_field(f"{where}.image_size", require(f"{where}.image_size", meta, "image_size"), (9, 2))
+
+
+def _intrinsics(where: str, meta: Mapping[str, Any]) -> np.ndarray:
+    return array_field(f"{where}.intris_mat", require(f"{where}.intris_mat", meta, "intris_mat"), (8, 3, 3))
 
 
 def _subject_meta(view: ArcticView) -> tuple[str, Mapping[str, Any]]:
@@ -189,9 +226,7 @@ def _camera(
     """K [3, 3] and cam_from_world [T, 4, 4] of the view."""
     if view.view == 0:
         return _egocentric_camera(view.raw("egocam.dist"), rows)
-    intrinsics = array_field(
-        f"{where}.intris_mat", require(f"{where}.intris_mat", meta, "intris_mat"), (8, 3, 3)
-    )
+    intrinsics = _intrinsics(where, meta)
     world2cam = array_field(f"{where}.world2cam", require(f"{where}.world2cam", meta, "world2cam"), (8, 4, 4))
     return intrinsics[view.view - 1], np.repeat(world2cam[view.view - 1][None], len(rows), axis=0)
 

@@ -17,12 +17,13 @@ import scipy.ndimage
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
+from bigs.data.touching import masks_touch
 from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
 from bigs.preprocess.hands import posed_track
 from bigs.preprocess.object_surface import SurfaceConfig, rough_surface
-from bigs.types import MASK_VALUES, Side
+from bigs.types import Side
 
 
 @dataclass(frozen=True)
@@ -160,13 +161,7 @@ def posed_vertices(track: HandTrack, model: HandModel) -> np.ndarray:
 
 def touching_frames(masks: np.ndarray, side: Side, reach: int) -> np.ndarray:
     """Frames [T] (bool) in which the masks of a hand and of the object come within `reach` pixels."""
-    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-    found = np.zeros(len(masks), dtype=bool)
-    for t, labels in enumerate(masks):
-        hand, item = labels == MASK_VALUES[side], labels == MASK_VALUES["object"]
-        if hand.any() and item.any():
-            found[t] = bool((scipy.ndimage.binary_dilation(hand, square) & item).any())
-    return found
+    return np.array([masks_touch(labels, side, reach) for labels in masks])
 
 
 def first_scale(

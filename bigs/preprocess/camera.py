@@ -1,4 +1,4 @@
-"""Where K comes from: the user, a COLMAP model, what the camera wrote down, or a stated assumption."""
+"""Where K comes from: the user, a COLMAP model, a data set, what the camera wrote, or an assumption."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 import pycolmap
 
 from bigs.checks import InputError
+from bigs.data.arctic import camera_of_images
+from bigs.preprocess.source import Source
 
 # Without any knowledge the focal length is taken to be this many times the longer side (46 degrees across).
 ASSUMED_FOCAL = 1.2
@@ -38,16 +40,13 @@ class CameraRequest:
     colmap: Path | None = None  # folder of a COLMAP model
 
 
-def find_camera(
-    request: CameraRequest, width: int, height: int, exif: Mapping[int, object], tags: Mapping[str, str]
-) -> Camera:
+def find_camera(request: CameraRequest, source: Source, width: int, height: int) -> Camera:
     """The camera of a source.
 
     Args:
         request: what the user gave.
-        width, height: of the source, pixels.
-        exif: of the first image, by number; empty for a video.
-        tags: of the video's container; empty for images.
+        source: of the pictures, which may say something of their camera.
+        width, height: of its pictures, pixels.
 
     Raises:
         InputError: more than one source is given, or what is given makes no camera.
@@ -69,7 +68,12 @@ def find_camera(
         return Camera(_centred(request.focal, width, height), "given as focal length", True)
     if request.colmap is not None:
         return _from_colmap(request.colmap, width, height)
-    equivalent = _equivalent_focal(exif, tags)
+    annotated = camera_of_images(source.path)
+    if annotated is not None:
+        K, (own_width, own_height) = annotated
+        factors = _factors(str(source.path), (own_width, own_height), width, height)
+        return Camera(scale_camera(K, *factors), "from ARCTIC's misc.json", True)
+    equivalent = _equivalent_focal(source.exif, source.tags)
     if equivalent is not None:
         focal = equivalent / _FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
         return Camera(
@@ -107,15 +111,21 @@ def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     if not cameras:
         raise InputError(f"{folder}: expected a COLMAP model with a camera, found none in it")
     camera = cameras[min(cameras)]
-    factor_x, factor_y = width / camera.width, height / camera.height
-    if abs(factor_x / factor_y - 1) > 0.02:
-        raise InputError(
-            f"{folder}: expected a camera with the proportions of {width} x {height}, "
-            f"found {camera.width} x {camera.height}"
-        )
+    factors = _factors(str(folder), (camera.width, camera.height), width, height)
     bent = "" if len(camera.params) <= 4 and "RADIAL" not in camera.model.name else ", distortion left out"
-    K = scale_camera(np.asarray(camera.calibration_matrix(), dtype=np.float64), factor_x, factor_y)
+    K = scale_camera(np.asarray(camera.calibration_matrix(), dtype=np.float64), *factors)
     return Camera(K, f"from COLMAP ({camera.model.name}{bent})", True)
+
+
+def _factors(where: str, own: tuple[int, int], width: int, height: int) -> tuple[float, float]:
+    """From a camera of size `own` to pictures of `width` x `height`, across and down."""
+    factors = width / own[0], height / own[1]
+    if abs(factors[0] / factors[1] - 1) > 0.02:
+        raise InputError(
+            f"{where}: expected a camera with the proportions of {width} x {height}, "
+            f"found {own[0]} x {own[1]}"
+        )
+    return factors
 
 
 def _equivalent_focal(exif: Mapping[int, object], tags: Mapping[str, str]) -> float | None:

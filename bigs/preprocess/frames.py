@@ -11,6 +11,7 @@ from PIL import Image
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
+from bigs.data.arctic import meta_of_images
 from bigs.preprocess.artefacts import FRAMES, FRAMES_FILE, FrameSet, content_digest, write_frame_set
 from bigs.preprocess.camera import CameraRequest, find_camera, scale_camera
 from bigs.preprocess.source import Source
@@ -42,9 +43,9 @@ class FrameConfig:
 
 def frame_inputs(source: Source, config: FrameConfig) -> str:
     """The digest of what `extract_frames` reads."""
-    colmap = config.camera.colmap
     parts = [source.path] if not source.images else list(source.images)
-    return content_digest(*parts, asdict(config), *([colmap] if colmap is not None else []))
+    cameras = [config.camera.colmap, meta_of_images(source.path)]
+    return content_digest(*parts, asdict(config), *(path for path in cameras if path is not None))
 
 
 def extract_frames(
@@ -97,7 +98,7 @@ def extract_frames(
     for stale in folder.glob("*.png"):
         if stale.stem.isdigit() and int(stale.stem) >= len(names):
             stale.unlink()
-    camera = find_camera(config.camera, *size, source.exif, source.tags)
+    camera = find_camera(config.camera, source, *size)
     width, height = _shrunk_size(*size, config.max_size)
     frames = FrameSet(
         names=tuple(names),

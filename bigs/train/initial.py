@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage
 import torch
 from torch import Tensor
 
 from bigs.data.base import Clip, HandTrack
+from bigs.data.touching import masks_touch
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.smoothing import interpolated_frames, smooth_rotations, smooth_vectors
 from bigs.geometry.surface import inlier_points
 from bigs.hand import HandModel, mirror_rotation
-from bigs.types import MASK_VALUES, HandObjectTrajectory, Side
+from bigs.types import HandObjectTrajectory, Side
 
 
 @dataclass(frozen=True)
@@ -157,11 +157,5 @@ def initial_trajectory(clip: Clip, hand_models: Mapping[Side, HandModel]) -> Han
 
 def touching_frames(clip: Clip, side: Side, reach: int = 3) -> np.ndarray:
     """Frames [T] (bool) in which the masks of a hand and of the object come within `reach` pixels."""
-    touching = np.zeros(len(clip), dtype=bool)
-    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-    for t in range(len(clip)):
-        if clip.mask_areas[side][t] and clip.mask_areas["object"][t]:
-            labels = clip.mask(t)
-            hand = scipy.ndimage.binary_dilation(labels == MASK_VALUES[side], square)
-            touching[t] = bool((hand & (labels == MASK_VALUES["object"])).any())
-    return touching
+    shown = (clip.mask_areas[side] > 0) & (clip.mask_areas["object"] > 0)
+    return np.array([bool(shown[t]) and masks_touch(clip.mask(t), side, reach) for t in range(len(clip))])

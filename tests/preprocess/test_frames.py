@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,51 @@ def test_colmap_gives_the_camera(folder: Path, tmp_path: Path) -> None:
     frames = extract(folder, tmp_path / "out", camera=CameraRequest(colmap=tmp_path / "sparse"))
     assert np.allclose(frames.K, [[150, 0, 45], [0, 155, 35], [0, 0, 1]])
     assert "COLMAP" in frames.camera and frames.focal_known
+
+
+def arctic_images(root: Path, view: int = 2, size: tuple[int, int] = (2 * WIDTH, 2 * HEIGHT)) -> Path:
+    """A folder of images as the release has it, of which view 2's camera has focal length 320."""
+    folder = root / "images" / "s01" / "box_grab_01" / str(view)
+    folder.mkdir(parents=True)
+    for t in range(4):
+        Image.fromarray(picture(t)).save(folder / f"{t:05d}.jpg")
+    K = np.array([[320.0, 0.0, 97.0], [0.0, 322.0, 65.0], [0.0, 0.0, 1.0]])
+    intrinsics = [(np.diag([1 + 0.1 * i, 1 + 0.1 * i, 1]) @ K).tolist() for i in range(-1, 7)]
+    (root / "meta").mkdir()
+    meta = {"s01": {"ioi_offset": 0, "image_size": [list(size)] * 9, "intris_mat": intrinsics}}
+    (root / "meta" / "misc.json").write_text(json.dumps(meta))
+    return folder
+
+
+def test_images_of_arctic_bring_their_camera(tmp_path: Path) -> None:
+    folder = arctic_images(tmp_path / "arctic")
+    frames = extract(folder, tmp_path / "out")
+    assert np.allclose(frames.K, [[160, 0, 48.5], [0, 161, 32.5], [0, 0, 1]])
+    assert frames.focal_known and "misc.json" in frames.camera
+    assert extract(folder, tmp_path / "out", camera=CameraRequest(focal=99.0)).K[0, 0] == 99.0
+
+
+def test_other_folders_have_no_camera_of_arctic(tmp_path: Path) -> None:
+    egocentric = arctic_images(tmp_path / "arctic", view=0)
+    assert not extract(egocentric, tmp_path / "out").focal_known
+    odd = arctic_images(tmp_path / "odd", size=(WIDTH, WIDTH))
+    with pytest.raises(InputError, match="expected a camera with the proportions of 96 x 64, found 96 x 96"):
+        extract(odd, tmp_path / "out")
+    (tmp_path / "odd" / "meta" / "misc.json").write_text('{"s02": {}}')
+    with pytest.raises(InputError, match=r"misc.json: s01: expected"):
+        extract(odd, tmp_path / "out")
+
+
+def test_4k_is_shrunk_unless_it_is_to_be_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "4k"
+    folder.mkdir()
+    for t in range(4):
+        Image.fromarray(picture(t)).resize((3840, 2160)).save(folder / f"{t}.jpg")
+    small = extract(folder, tmp_path / "small", camera=CameraRequest(focal=4000.0))
+    assert (small.width, small.height, small.source_size) == (1280, 720, (3840, 2160))
+    assert small.K[0, 0] == pytest.approx(4000 / 3)
+    whole = extract(folder, tmp_path / "whole", camera=CameraRequest(focal=4000.0), max_size=0)
+    assert (whole.width, whole.height, whole.K[0, 0]) == (3840, 2160, 4000.0)
 
 
 @pytest.mark.parametrize(
