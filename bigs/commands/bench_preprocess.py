@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 import bigs
@@ -26,6 +27,7 @@ from bigs.commands.truth import find_ground_truth
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_annotation, load_ground_truth
 from bigs.data.hold import load_hold
+from bigs.geometry.rotations import robust_mean_rotation
 from bigs.hand import HandModel, load_hand_models
 from bigs.metrics.report import evaluate
 from bigs.preprocess.artefacts import (
@@ -195,8 +197,9 @@ def _measure(
 def object_errors(alignment: Alignment, rotations: np.ndarray, transl: np.ndarray) -> ObjectErrors:
     """Compare with the true poses [T, 3, 3] and [T, 3], metres."""
     found = alignment.object_rotations
-    turn = _usual_rotation(found.transpose(0, 2, 1) @ rotations)
-    between = Rotation.from_matrix(found.transpose(0, 2, 1) @ rotations @ turn.T)
+    between = found.transpose(0, 2, 1) @ rotations
+    usual = robust_mean_rotation(torch.from_numpy(between)).numpy()
+    degrees = np.degrees(Rotation.from_matrix(between @ usual.T).magnitude())
     # The true frame's origin lies somewhere in the found one: transl = size_ratio (t + R o), robustly.
     shift, ratio, weight = np.zeros(3), 1.0, np.ones(len(transl))
     for _ in range(20):
@@ -209,21 +212,7 @@ def object_errors(alignment: Alignment, rotations: np.ndarray, transl: np.ndarra
         error = np.linalg.norm(columns @ solution - transl, axis=1)
         weight = 1.0 / np.maximum(error, 1e-3)
     placed = ratio * alignment.object_transl + found @ shift
-    return ObjectErrors(
-        np.degrees(between.magnitude()), 1000.0 * np.linalg.norm(placed - transl, axis=1), 1.0 / ratio
-    )
-
-
-def _usual_rotation(rotations: np.ndarray) -> np.ndarray:
-    """The rotation [3, 3] with the least sum of angles to `rotations` [T, 3, 3]."""
-    among = Rotation.from_matrix(rotations)
-    # The start is the member that is nearest to all others, so that a wrong half cannot pull it away.
-    apart = np.array([np.minimum((one.inv() * among).magnitude(), 0.2).sum() for one in among])
-    mean = among[int(apart.argmin())]
-    for _ in range(20):
-        angles = (mean.inv() * among).magnitude()
-        mean = Rotation.concatenate([among]).mean(1.0 / np.maximum(angles, np.radians(0.05)))
-    return mean.as_matrix()
+    return ObjectErrors(degrees, 1000.0 * np.linalg.norm(placed - transl, axis=1), 1.0 / ratio)
 
 
 def _request(

@@ -79,8 +79,8 @@ def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndar
     return bundle
 
 
-def turn_uncertainty(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor: int) -> np.ndarray:
-    """Standard deviation of each frame's rotation against that of frame `anchor`, [T] degrees.
+def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> np.ndarray:
+    """Standard deviation of each frame's rotation against that of every other, [T, T] degrees.
 
     To first order, for independent reprojection errors of `config.pixel_sigma`. The gauge has no part in it.
     """
@@ -89,10 +89,10 @@ def turn_uncertainty(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor
     covariance = np.linalg.pinv(_reduced(system, 0.0)[0], rcond=1e-10, hermitian=True)
     blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
     own = np.einsum("titi->t", blocks)
-    # A turn of the anchor by d is seen in frame t as the same turn of the object, carried along.
-    carry = bundle.rotations @ bundle.rotations[anchor].T
-    cross = np.einsum("tij,tij->t", blocks[:, :, anchor], carry)
-    return np.degrees(np.sqrt((own + own[anchor] - 2.0 * cross).clip(0.0)))
+    # A turn of frame s by d is seen in frame t as the same turn of the object, carried along.
+    carry = np.einsum("tij,skj->tsik", bundle.rotations, bundle.rotations)
+    cross = np.einsum("tisj,tsij->ts", blocks, carry)
+    return np.degrees(np.sqrt((own[:, None] + own - 2.0 * cross).clip(0.0)))
 
 
 class _System(NamedTuple):

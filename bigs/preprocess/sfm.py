@@ -13,10 +13,11 @@ from bigs.preprocess.artefacts import ObjectSfm
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
 from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_features
-from bigs.preprocess.sfm_grow import GrowConfig, grow, polish
+from bigs.preprocess.sfm_grow import GrowConfig, grow
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
 from bigs.preprocess.sfm_models import Mapping, MappingConfig, frame_pairs, map_features
 from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
+from bigs.preprocess.sfm_refine import RefineConfig, refine
 from bigs.preprocess.sfm_seed import Seed, find_seed
 from bigs.preprocess.tracks import Tracks, join_matches
 from bigs.preprocess.words import frame_ranges
@@ -31,6 +32,7 @@ class SfmConfig:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     map: MapConfig = field(default_factory=MapConfig)
     grow: GrowConfig = field(default_factory=GrowConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
     checks: CheckConfig = field(default_factory=CheckConfig)
     # How many partial models are tried as the start before the best outcome is taken.
     seeds: int = 3
@@ -62,6 +64,7 @@ _EXPLAINED = {
     "depth may be reversed": "its mirror image in depth fits better, so the turn may be the wrong way",
     "turn changes": "the turn changes abruptly; look whether the hand really did that",
     "long step": "the object jumps between two frames",
+    "models disagree": "a model made of them alone turns otherwise, so their turn may be off",
 }
 
 
@@ -129,6 +132,7 @@ class _Attempt(NamedTuple):
     seed: Seed
     model: int
     checks: SfmChecks
+    misfit: float  # before points were sought that were never matched
 
 
 def _map(
@@ -158,7 +162,7 @@ def _map(
 def _best_attempt(
     features: Sequence[FrameFeatures], tracks: Tracks, mapping: Mapping, K: np.ndarray, config: SfmConfig
 ) -> tuple[_Attempt, int]:
-    """Start from one model after another until nothing serious is found, else take the best outcome."""
+    """Start from one model after another until nothing serious is found; the best fit counts."""
     best: _Attempt | None = None
     tried = 0
     for number, model in enumerate(mapping.models[: config.seeds]):
@@ -168,11 +172,12 @@ def _best_attempt(
             continue
         tried += 1
         grow(map_, config.grow)
-        polish(map_, config.grow.rounds)
+        map_, misfit = refine(map_, tracks, mapping.models, seed.frames, config.refine)
         if not map_.use().any():
             continue
-        attempt = _Attempt(map_, seed, number, check_map(map_, features, tracks, config.checks))
-        if best is None or _rank(attempt) > _rank(best):
+        checks = check_map(map_, features, tracks, mapping.models, config.checks)
+        attempt = _Attempt(map_, seed, number, checks, misfit)
+        if best is None or attempt.misfit < best.misfit:
             best = attempt
         if not best.checks.doubtful().any():
             break
@@ -183,10 +188,6 @@ def _best_attempt(
             "frames) that all jump; film the object turning more slowly, or supply processed/object_sfm.npz"
         )
     return best, tried
-
-
-def _rank(attempt: _Attempt) -> tuple[int, int]:
-    return -int(attempt.checks.doubtful().sum()), int(attempt.checks.sightings.sum())
 
 
 def _neighbour_matches(mapping: Mapping, frames: int) -> np.ndarray:

@@ -13,9 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.bundle import turn_uncertainty
+from bigs.preprocess.bundle import turn_uncertainties
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_features import FrameFeatures
+from bigs.preprocess.sfm_models import PartialModel
+from bigs.preprocess.sfm_refine import disagreement
 from bigs.preprocess.sfm_seed import mirror_misfits
 from bigs.preprocess.tracks import Tracks
 
@@ -35,6 +37,8 @@ class CheckConfig:
     least_long_step: float = 8.0
     # Misfit over that of the mirror image in depth. Right segments reached 0.97 where little was seen.
     mirror_share: float = 0.975
+    # A partial model's turns that differ from the map's by more than this, degrees.
+    most_disagreement: float = 5.0
     # Frames that are compared with their mirror image together, half of them with the next ones too.
     mirror_window: int = 20
 
@@ -43,7 +47,7 @@ class SfmChecks(NamedTuple):
     """What was found in each frame."""
 
     sightings: np.ndarray  # [T] believed sightings of points
-    uncertainty: np.ndarray  # [T] degrees against the frame that is tied best
+    uncertainty: np.ndarray  # [T] degrees against the frame that most others are tied to
     mirror: np.ndarray  # [T] misfit over that of the mirror image, the worst window's; above 1 is wrong
     cosine: np.ndarray  # [T] of angular velocity before and after; 1 where nothing turns
     flags: list[list[str]]  # T lists of plain words; empty where nothing is wrong
@@ -58,12 +62,17 @@ LOOSE = "tied loosely"
 REVERSED = "depth may be reversed"
 TURN = "turn changes"
 STEP = "long step"
+OTHERWISE = "models disagree"
 # A turn that changes may be real; the others are not.
-_SERIOUS = {FEW, LOOSE, REVERSED, STEP}
+_SERIOUS = {FEW, LOOSE, REVERSED, STEP, OTHERWISE}
 
 
 def check_map(
-    map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, config: CheckConfig
+    map_: ObjectMap,
+    features: Sequence[FrameFeatures],
+    tracks: Tracks,
+    models: Sequence[PartialModel],
+    config: CheckConfig,
 ) -> SfmChecks:
     """All checks of a map whose frames all have poses. `tracks` are those of the matches alone."""
     frames = len(map_.posed)
@@ -71,7 +80,10 @@ def check_map(
     bundle, _ = map_.bundle(np.arange(frames))
     # The prior is all but lifted: what counts is what the observations say.
     loose = replace(map_.config.bundle, turn_sigma=3.0, shift_sigma=0.015)
-    uncertainty = turn_uncertainty(bundle, map_.K, loose, int(sightings.argmax()))
+    between = turn_uncertainties(bundle, map_.K, loose)
+    # Of two parts that hang together loosely the larger one is believed.
+    tied = (between <= config.most_uncertain).sum(1)
+    uncertainty = between[max(range(frames), key=lambda t: (tied[t], sightings[t]))]
     mirror = _mirror_ratios(map_, features, tracks, config.mirror_window)
     cosine = turn_cosines(map_.rotations)
     steps = _step_angles(map_.rotations)
@@ -79,12 +91,17 @@ def check_map(
     long_step = np.zeros(frames, dtype=bool)
     for t in np.flatnonzero(steps > max(config.long_step * usual, config.least_long_step)):
         long_step[t : t + 2] = True
+    otherwise = np.zeros(frames, dtype=bool)
+    for model in models:
+        rows, degrees = disagreement(map_.rotations, model)
+        otherwise[model.frames[rows[degrees > config.most_disagreement]]] = True
     signs = {
         FEW: sightings < config.least_sightings,
         LOOSE: uncertainty > config.most_uncertain,
         REVERSED: mirror > config.mirror_share,
         TURN: cosine < config.least_cosine,
         STEP: long_step,
+        OTHERWISE: otherwise,
     }
     flags = [[word for word, found in signs.items() if found[t]] for t in range(frames)]
     return SfmChecks(sightings, uncertainty, mirror, cosine, flags)

@@ -30,8 +30,6 @@ class GrowConfig:
     # The motion prior is weaker while growing: each prediction is an extrapolation.
     turn_sigma: float = 0.6
     shift_sigma: float = 0.003
-    # Rounds of bundle adjustment of everything at the end.
-    rounds: int = 3
 
 
 def grow(map_: ObjectMap, config: GrowConfig) -> None:
@@ -54,19 +52,6 @@ def grow(map_: ObjectMap, config: GrowConfig) -> None:
         map_.adjust(frames, free, fine)
         map_.judge()
         map_.triangulate()
-
-
-def polish(map_: ObjectMap, rounds: int) -> None:
-    """Bundle adjustment of everything, with points sought again in all frames between the rounds."""
-    frames = np.arange(len(map_.posed))
-    everything = np.ones(len(frames), dtype=bool)
-    for round_ in range(rounds):
-        map_.adjust(frames, everything, map_.config.bundle)
-        map_.judge()
-        map_.triangulate()
-        if round_ + 1 < rounds:
-            for t in range(len(frames)):
-                map_.search(t)
 
 
 def _next_frame(map_: ObjectMap) -> tuple[int, int]:

@@ -8,8 +8,18 @@ from scipy.spatial.transform import Rotation
 from turning_object import TurningObject, rotation_errors, turning_object
 
 from bigs.preprocess.object_map import ObjectMap
-from bigs.preprocess.sfm_checks import FEW, LOOSE, REVERSED, TURN, CheckConfig, check_map, turn_cosines
-from bigs.preprocess.sfm_grow import GrowConfig, grow, polish
+from bigs.preprocess.sfm_checks import (
+    FEW,
+    LOOSE,
+    OTHERWISE,
+    REVERSED,
+    TURN,
+    CheckConfig,
+    check_map,
+    turn_cosines,
+)
+from bigs.preprocess.sfm_grow import GrowConfig, grow
+from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, spliced_poses
 from bigs.preprocess.sfm_seed import find_seed, smooth_run
 from bigs.preprocess.tracks import join_matches
 
@@ -91,7 +101,7 @@ def test_frames_without_a_known_point_are_left_where_they_are(egg: TurningObject
 
 
 def test_nothing_is_flagged_where_nothing_is_wrong(egg: TurningObject) -> None:
-    checks = check_map(at_truth(egg), egg.features, egg.tracks(), CheckConfig())
+    checks = check_map(at_truth(egg), egg.features, egg.tracks(), (), CheckConfig())
     assert not any(checks.flags)
     assert checks.mirror.max() < 0.9
 
@@ -104,7 +114,7 @@ def test_a_reversed_segment_is_flagged(egg: TurningObject) -> None:
     rotations[20:] = back
     found = egg.map()
     found.restart(np.arange(40), rotations, egg.transl)
-    checks = check_map(found, egg.features, egg.tracks(), CheckConfig())
+    checks = check_map(found, egg.features, egg.tracks(), (), CheckConfig())
     assert all(REVERSED in words for words in checks.flags[25:])
     assert checks.doubtful()[25:].all()
     assert any(TURN in words for words in checks.flags[17:24])
@@ -114,10 +124,66 @@ def test_a_reversed_segment_is_flagged(egg: TurningObject) -> None:
 def test_frames_that_see_nothing_and_what_hangs_behind_them_are_flagged() -> None:
     egg = turning_object(hidden=range(22, 29), seed=2)
     found = at_truth(egg)
-    checks = check_map(found, egg.features, egg.tracks(), CheckConfig())
+    checks = check_map(found, egg.features, egg.tracks(), (), CheckConfig())
     assert all(FEW in checks.flags[t] for t in range(22, 29))
     assert not any(FEW in checks.flags[t] for t in range(20))
     assert all(LOOSE in words for words in checks.flags[22:29])
+
+
+def bent(egg: TurningObject, since: int, degrees: float) -> np.ndarray:
+    """The true rotations [T, 3, 3] with all from `since` on turned about the camera's axes."""
+    angle = np.where(np.arange(len(egg.rotations)) >= since, np.radians(degrees), 0.0)
+    return Rotation.from_rotvec(angle[:, None] * (0.3, 0.8, 0.5)).as_matrix() @ egg.rotations
+
+
+def test_of_two_loosely_tied_parts_the_larger_is_believed() -> None:
+    egg = turning_object(hidden=range(10, 21), seed=5)
+    checks = check_map(at_truth(egg), egg.features, egg.tracks(), (), CheckConfig())
+    flagged = np.array([LOOSE in words for words in checks.flags])
+    assert flagged[:10].all() and not flagged[21:].any()
+
+
+def test_a_partial_model_that_turns_otherwise_is_told() -> None:
+    egg = turning_object(seed=6)
+    model = egg.model(range(22, 40))
+    rows, degrees = disagreement(bent(egg, 36, 20.0), model)
+    assert list(rows) == list(range(18))
+    assert degrees[:14].max() < 5.0 and degrees[14:].min() > 12.0
+    found = egg.map()
+    found.restart(np.arange(40), bent(egg, 36, 20.0), egg.transl)
+    checks = check_map(found, egg.features, egg.tracks(), (model,), CheckConfig())
+    flagged = np.array([OTHERWISE in words for words in checks.flags])
+    assert flagged[36:].all() and not flagged[:36].any()
+    assert not disagreement(egg.rotations, model._replace(points=model.points[:20]))[1].size
+
+
+def test_a_bent_map_is_made_anew(egg: TurningObject) -> None:
+    """Forgetting early mistakes is enough where frames see each other's points."""
+    found = egg.map()
+    found.restart(np.arange(40), bent(egg, 30, 3.0), egg.transl)
+    assert rotation_errors(found.rotations, egg.rotations).max() > 2.0
+    better, _ = refine(found, egg.tracks(), (), np.arange(10), RefineConfig())
+    assert rotation_errors(better.rotations, egg.rotations).max() < 0.6
+
+
+def test_a_partial_model_takes_the_place_of_a_bent_part(egg: TurningObject) -> None:
+    """The map goes astray after frame 20; a model of the later frames was made without crossing to them."""
+    found = egg.map()
+    turns = np.radians(np.clip(np.arange(40) - 20, 0, 15) * 3.0)
+    rotations = Rotation.from_rotvec(turns[:, None] * (0.2, 0.9, 0.1)).as_matrix() @ egg.rotations
+    found.restart(np.arange(40), rotations, egg.transl)
+    models = (egg.model(range(0, 15)), egg.model(range(19, 40)))
+    offered = list(spliced_poses(found, models, np.arange(15), RefineConfig()))
+    assert len(offered) == len(RefineConfig().depths)
+    assert rotation_errors(rotations, egg.rotations).max() > 20.0
+    assert rotation_errors(offered[0][0], egg.rotations).max() < 1.0
+    misfits = []
+    for pose in ((rotations, egg.transl), offered[0]):
+        found.restart(np.arange(40), *pose)
+        found.settle()
+        misfits.append(found.misfit())
+    assert misfits[1] <= misfits[0]
+    assert not list(spliced_poses(at_truth(egg), models, np.arange(15), RefineConfig()))
 
 
 def test_a_turn_that_goes_back_is_a_warning_and_no_more() -> None:
