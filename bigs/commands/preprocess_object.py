@@ -28,6 +28,7 @@ from bigs.preprocess.artefacts import (
     frame_paths,
     mask_paths,
     read_alignment,
+    read_depth_sigma,
     read_frame_set,
     read_hands,
     read_notes,
@@ -88,7 +89,7 @@ def align_step(request: PreprocessRequest, listen: Callable[[str], None]) -> Ste
     frames = read_frame_set(processed)
     count = len(frames.names)
     file, picture = processed / ALIGNED_FILE, processed / "aligned.png"
-    config = AlignConfig()
+    config = AlignConfig(shift_sigma=read_depth_sigma(processed / HANDS_FILE))
     model = "built-in" if request.hand_model is None else request.hand_model
     parts = (processed / HANDS_FILE, processed / SFM_FILE, processed / MASKS)
     inputs = content_digest(*parts, model, frames.K, asdict(config))

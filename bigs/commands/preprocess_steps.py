@@ -23,6 +23,7 @@ from bigs.preprocess.artefacts import (
     MASKS,
     MASKS_FILE,
     SFM_FILE,
+    USUAL_DEPTH_SIGMA,
     FrameSet,
     content_digest,
     frame_paths,
@@ -147,7 +148,8 @@ def hands_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
             keypoints = read_keypoints(source, frames)
         listen("fitting")
         found = fit_hands(keypoints, frames.K, models, fps=frames.fps, masks=labels, config=config)
-    write_hands(file, found.tracks, inputs)
+    sigma = USUAL_DEPTH_SIGMA if option == "--hands" else config.depth_sigma
+    write_hands(file, found.tracks, inputs, sigma)
     _draw_hands(picture, processed, frames, found, models)
     return StepOutcome("hands", "made", _hands_summary(found.tracks), found.notes, picture)
 

@@ -20,7 +20,7 @@ from bigs.data.base import HandTrack
 from bigs.data.touching import masks_touch
 from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel
-from bigs.preprocess.artefacts import Alignment, ObjectSfm
+from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
 from bigs.preprocess.hands import posed_track
 from bigs.preprocess.object_surface import SurfaceConfig, rough_surface
 from bigs.types import Side
@@ -45,8 +45,10 @@ class AlignConfig:
     penetration: float = 2.0
     depth: float = 0.003
     # Weights of a shift's square in units of `shift_sigma`, and of its change from frame to frame in units
-    # of `change_sigma`, both shares of the depth.
-    shift_sigma: float = 0.04
+    # of `change_sigma`, both shares of the depth. Beyond about `shift_outlier` sigmas a shift costs little
+    # more, but where hands are where they should be, contact is no reason to move them.
+    shift_sigma: float = USUAL_DEPTH_SIGMA
+    shift_outlier: float = 3.0
     change_sigma: float = 0.005
     prior: float = 0.1
     # Mask pixels of hand and object that are this near each other touch.
@@ -206,7 +208,8 @@ def contact_costs(
     depth = np.median(verts[:, :, 2], axis=1)
     shares = np.linspace(-config.reach, config.reach, config.shifts)
     shifts = depth[:, None] * shares
-    costs = np.tile(config.prior * (shares / config.shift_sigma) ** 2, (len(verts), 1))
+    squares = (shares / config.shift_sigma) ** 2
+    costs = np.tile(config.prior * squares / (1.0 + squares / config.shift_outlier**2), (len(verts), 1))
     count = min(max(config.nearest // config.every, 1), verts.shape[1])
     for t in np.flatnonzero(touching):
         at = (verts[t] @ rotations[t]) / factor - transl[t] @ rotations[t]

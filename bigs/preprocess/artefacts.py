@@ -171,10 +171,16 @@ def mask_paths(processed: Path, frames: FrameSet) -> list[Path]:
     return _numbered(processed / MASKS, len(frames.names))
 
 
-def write_hands(path: Path, hands: Mapping[Side, HandTrack], inputs: str) -> None:
+# How far a hand's depth is usually off, as a share of it, where an estimator does not say (HaMeR's kind).
+USUAL_DEPTH_SIGMA = 0.04
+
+
+def write_hands(
+    path: Path, hands: Mapping[Side, HandTrack], inputs: str, depth_sigma: float = USUAL_DEPTH_SIGMA
+) -> None:
     """Write `hands.npz`: `SIDE.global_orient` [T, 3], `SIDE.hand_pose` [T, 45], `SIDE.betas`, `SIDE.transl`,
-    `SIDE.valid`; the tracks are in the camera frame of their time."""
-    arrays: dict[str, Any] = {}
+    `SIDE.valid`, `depth_sigma`; the tracks are in the camera frame of their time."""
+    arrays: dict[str, Any] = {"depth_sigma": np.float64(depth_sigma)}
     for side, track in hands.items():
         arrays |= {
             f"{side}.global_orient": track.global_orient,
@@ -211,6 +217,19 @@ def read_hands(path: Path, frames: int) -> dict[Side, HandTrack]:
             valid=field("valid", (frames,)).astype(bool),
         )
     return hands
+
+
+def read_depth_sigma(path: Path) -> float:
+    """How far the depth of the hands in `hands.npz` is usually off, as a share of it.
+
+    Raises:
+        InputError: missing, damaged, or not a positive number.
+    """
+    stored = _read_npz(path)
+    value = float(array_field(f"{path}: depth_sigma", stored.get("depth_sigma", USUAL_DEPTH_SIGMA), ()))
+    if value <= 0:
+        raise InputError(f"{path}: depth_sigma: expected a positive number, found {value:g}")
+    return value
 
 
 def write_object_sfm(path: Path, sfm: ObjectSfm, inputs: str) -> None:

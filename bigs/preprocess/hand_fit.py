@@ -41,6 +41,9 @@ class HandFitConfig:
     reach: float = 0.008
     # A frame with fewer keypoints, or fewer that are explained, is marked as having no estimate.
     joints_needed: int = 8
+    # By what share of it depth is off from frame to frame and between the hands; an error of the shared size
+    # is no error between hands and object.
+    depth_sigma: float = 0.01
 
 
 class HandFit(NamedTuple):

@@ -36,6 +36,8 @@ class SfmConfig:
     checks: CheckConfig = field(default_factory=CheckConfig)
     # How many partial models are tried as the start before the best outcome is taken.
     seeds: int = 3
+    # The largest model is the surest start: another's outcome must have less than this share of its misfit.
+    clearly_better: float = 0.97
 
 
 class SfmReport(NamedTuple):
@@ -177,7 +179,7 @@ def _best_attempt(
             continue
         checks = check_map(map_, features, tracks, mapping.models, config.checks)
         attempt = _Attempt(map_, seed, number, checks, misfit)
-        if best is None or attempt.misfit < best.misfit:
+        if best is None or attempt.misfit < config.clearly_better * best.misfit:
             best = attempt
         if not best.checks.doubtful().any():
             break

@@ -95,6 +95,17 @@ def test_hands_at_wrong_depths_are_brought_to_the_object(truth: Truth) -> None:
         assert after.mean() < 0.7 * before.mean()
 
 
+def test_hands_whose_depth_is_known_well_are_left_there(truth: Truth) -> None:
+    """Contact moves those that an estimator places badly, and not those that it places well."""
+    hands = pushed(truth, 0.04 * np.cos(np.linspace(0.0, 3.1, FRAMES)))
+    moved = {}
+    for sigma in (0.01, 0.04):
+        config = AlignConfig(shift_sigma=sigma)
+        found, _ = align(hands, truth.sfm, truth.masks, truth.K, truth.models, config)
+        moved[sigma] = sum(np.abs(found.hand_transl[side] - hands[side].transl).mean() for side in hands)
+    assert moved[0.01] < 0.6 * moved[0.04] and moved[0.04] > 0.01
+
+
 def test_without_contact_the_object_is_put_at_the_hands_depth(truth: Truth) -> None:
     apart = np.where(truth.masks == 50, 0, truth.masks)
     apart[:, :4, :4] = 50

@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.preprocess.artefacts import (
+    USUAL_DEPTH_SIGMA,
     Alignment,
     FrameSet,
     ObjectSfm,
     content_digest,
     read_alignment,
+    read_depth_sigma,
     read_frame_set,
     read_hands,
     read_object_sfm,
@@ -85,6 +87,19 @@ def test_every_artefact_comes_back(tmp_path: Path) -> None:
     found = read_alignment(tmp_path / "aligned.npz", T)
     assert same(found, aligned) and found.hand_transl.keys() == {"left"}
     assert np.array_equal(found.hand_transl["left"], aligned.hand_transl["left"])
+
+
+def test_how_far_depth_is_off_comes_back(tmp_path: Path) -> None:
+    file = tmp_path / "hands.npz"
+    write_hands(file, {"right": hand(0)}, "x", 0.01)
+    assert read_depth_sigma(file) == 0.01
+    stored = dict(np.load(file))
+    del stored["depth_sigma"]
+    np.savez(file, **stored)
+    assert read_depth_sigma(file) == USUAL_DEPTH_SIGMA
+    np.savez(file, **stored, depth_sigma=-1.0)
+    with pytest.raises(InputError, match="depth_sigma: expected a positive number, found -1"):
+        read_depth_sigma(file)
 
 
 def test_an_artefact_is_current_until_an_input_changes(tmp_path: Path) -> None:
