@@ -39,6 +39,7 @@ from bigs.train.presets import PRESETS
         "prior fit",
         "bench",
         "bench engine",
+        "bench preprocess",
         "bench reconstruct",
     ],
 )
@@ -71,6 +72,7 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "bench": "Measure how fast",
         "ablate": "beside the paper's Table 3",
         "bench engine": "runs of everything",
+        "bench preprocess": "simulated keypoints",
         "bench reconstruct": "growth of the cost",
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:
