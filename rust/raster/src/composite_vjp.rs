@@ -37,7 +37,7 @@ fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], size: usize) 
         .collect()
 }
 
-/// The vjp of [`composite`].
+/// The vjp of [`crate::composite::composite`].
 pub(crate) fn composite_vjp<T: Real>(
     scene: &Scene<'_, T>,
     canvas: &Canvas<T>,

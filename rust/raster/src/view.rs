@@ -44,7 +44,7 @@ impl<T: Real> ViewState<T> {
         self.binned.chunks().iter().map(|cover| cover.visible).sum()
     }
 
-    /// See [`Frame::median_ids`].
+    /// See [`crate::Frame::median_ids`].
     pub(crate) fn median_ids(&self) -> Vec<i32> {
         let scene = Scene {
             grid: self.grid,
