@@ -36,15 +36,17 @@ class SymmetryConfig:
     least_support: float = 0.12
     # And of those that say anything: the others contradict the clip.
     least_share: float = 0.75
-    # Share that may contradict.
+    # Share that may contradict, at least, and as a share of the support: where much was seen, wrong poses and
+    # masks contradict everywhere a little.
     most_contradiction: float = 0.06
+    contradiction_per_support: float = 0.13
     # Share that must fall where nobody looked: a symmetry that adds nothing is of no use.
     least_new: float = 0.05
     # The colours that meet must be nearer to each other than this share of what chance would make them.
     most_color_error: float = 0.85
     # How much worse, in support less three times the contradictions, a shift by 1.5 tolerances or a turn by 5
     # degrees must be.
-    least_sharpness: float = 0.03
+    least_sharpness: float = 0.015
 
 
 def find_symmetries(
@@ -126,11 +128,12 @@ class _Judge:
                 refined.append(symmetry)
         for symmetry in sorted(map(self._polished, refined[:_POLISHED]), key=self.worth, reverse=True):
             support, contradiction, color = self.evidence(symmetry)
+            most = self.config.most_contradiction
             if (
                 not any(_alike(symmetry, other, self.size) for other in known)
                 and support + contradiction <= 1.0 - self.config.least_new
                 and support >= self.config.least_support
-                and contradiction <= self.config.most_contradiction
+                and contradiction <= max(most, self.config.contradiction_per_support * support)
                 and support >= self.config.least_share * (support + contradiction)
                 and color <= self.config.most_color_error
                 and self._sharpness(symmetry) >= self.config.least_sharpness

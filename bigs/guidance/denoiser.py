@@ -46,6 +46,11 @@ class Denoiser(Protocol):
         """How to make the edges that `predict` needs; None for a model that is not conditioned on edges."""
         ...
 
+    @property
+    def fingerprint(self) -> str:
+        """Changes with weights and whatever else estimates depend on, not with where they lie."""
+        ...
+
     def encode(self, images: Tensor) -> Tensor:
         """Pictures [B, 3, image_size, image_size] in [0, 1] to latents [B, c, h, w]; differentiable.
 

@@ -13,7 +13,8 @@ from bigs.checks import InputError
 from bigs.guidance.denoiser import Conditions, EdgeDetector, classifier_free
 from bigs.guidance.diffusers_folder import Device, Parts, Precision, load_parts
 from bigs.guidance.edges import soft_edges
-from bigs.guidance.pidinet import load_pidinet
+from bigs.guidance.fingerprint import fingerprint
+from bigs.guidance.pidinet import PiDiNet, load_pidinet
 from bigs.guidance.prompts import PromptConfig, view_indices, view_prompts
 from bigs.guidance.token_file import Token, add_token, read_token
 
@@ -70,6 +71,15 @@ class StableDiffusion:
         self._edges: EdgeDetector | None = None
         if parts.controlnet is not None:
             self._edges = lambda images: edges(images.to(parts.device))
+        self._settings = (
+            *(prompts, dict(parts.scheduler.config), guidance_scale, conditioning_scale),
+            *(() if token is None else (token.name, token.embedding.double().tolist())),
+        )
+        weights = [network.state_dict() for network in parts.networks]
+        weights += [edges.weights] if isinstance(edges, PiDiNet) else []
+        self._weights = {
+            f"{i}.{name}": value for i, part in enumerate(weights) for name, value in part.items()
+        }
         with torch.no_grad():
             word = None if token is None else add_token(parts, token)
             self._texts = encode_text(parts, view_prompts(prompts, word))
@@ -88,6 +98,10 @@ class StableDiffusion:
     @property
     def detect_edges(self) -> EdgeDetector | None:
         return self._edges
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self._weights, self._settings)
 
     def encode(self, images: Tensor) -> Tensor:
         """The mean of the VAE's distribution, scaled as the model expects its latents."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from bigs.guidance.denoiser import Conditions, EdgeDetector, classifier_free
 from bigs.guidance.edges import soft_edges
+from bigs.guidance.fingerprint import fingerprint
 
 PIXELS = 64
 _TIMESTEPS = 1000
@@ -117,6 +118,10 @@ class PixelDenoiser:
         self.alphas_cumprod = cosine_alphas()
         self.image_size = PIXELS
         self.detect_edges: EdgeDetector | None = soft_edges
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.net.state_dict(), (self.net.config, self.guidance_scale))
 
     def encode(self, images: Tensor) -> Tensor:
         return 2.0 * images - 1.0

@@ -76,3 +76,14 @@ def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> Ob
     )
     detail.weights.copy_(each(whole.weights[kept]))
     return detail
+
+
+def replace_gaussians(detail: ObjectDetail, kept: Tensor, added: CanonicalObject) -> ObjectDetail:
+    """The Gaussians marked in `kept` [N] (bool), to the last bit, and after them those of `added`."""
+    count = len(added.means)
+    more = (split_object(added, 1, 0.0) if count else ObjectDetail(0)).state_dict()
+    joined = ObjectDetail(int(kept.sum()) + count)
+    joined.load_state_dict(
+        {name: torch.cat([values[kept], more[name]]) for name, values in detail.state_dict().items()}
+    )
+    return joined

@@ -71,12 +71,9 @@ class Scene(nn.Module):
         )
         self.object_splats = object_splats
         self.object_poses = object_poses
-        # Kept with what is trained: a prior may move it.
-        verts, faces = (
-            (None, None) if object_surface is None else (object_surface.verts, object_surface.faces)
-        )
-        self.register_buffer("surface_verts", verts)
-        self.register_buffer("surface_faces", faces, persistent=False)
+        # Kept with what is trained: a prior may change it.
+        self.register_buffer("surface_verts", None if object_surface is None else object_surface.verts)
+        self.register_buffer("surface_faces", None if object_surface is None else object_surface.faces)
         self.object_distance = object_distance
         self.lighting = lighting
 
@@ -85,6 +82,10 @@ class Scene(nn.Module):
         if self.surface_verts is None:
             return None
         return ObjectSurface(self.surface_verts, self.surface_faces)
+
+    def replace_surface(self, surface: ObjectSurface) -> None:
+        """Give the object another surface, of any number of vertices."""
+        self.surface_verts, self.surface_faces = surface.verts, surface.faces
 
     @property
     def sides(self) -> tuple[Side, ...]:

@@ -21,7 +21,6 @@ from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.carving import carve, convex_surface
-from bigs.train.completion import CompletionConfig, complete, with_points
 from bigs.train.initial import (
     InitialConfig,
     ObjectStart,
@@ -38,7 +37,6 @@ class SceneStart(NamedTuple):
 
     scene: Scene
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
-    facts: dict[str, str]  # what was found out
 
 
 def build_scene(
@@ -49,7 +47,6 @@ def build_scene(
     hand: HandSplatsConfig,
     obj: ObjectSplatsConfig,
     lighting: bool,
-    completion: CompletionConfig | None = None,
 ) -> SceneStart:
     """A scene at its start values.
 
@@ -59,7 +56,6 @@ def build_scene(
         hand_models: both sides' models in their files' own conventions.
         initial, hand, obj: see those classes.
         lighting: whether colours depend on the direction a surface faces.
-        completion: how to complete by symmetry what of the object was never seen; None leaves it.
     """
     starts = {
         side: smooth_hand(
@@ -69,22 +65,12 @@ def build_scene(
     }
     canonical = _canonical_hands(clip, hand_models, hand)
     skipped: list[str] = []
-    facts: dict[str, str] = {}
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
         try:
             carving = carve(clip, unknown, start, initial)
-            if completion is None:
-                grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
-            else:
-                found = complete(carving, start, initial, completion)
-                grid, start = found.surface, with_points(start, found)
-                facts["object seen"] = f"{found.seen:.0%} of its surface"
-                if found.symmetries:
-                    facts["object completed"] = str(found)
-                else:
-                    skipped.append(f"completion by symmetry: {found}")
+            grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
             verts, faces = extract_mesh(grid)
         except (ValueError, scipy.spatial.QhullError) as reason:
             skipped.append(f"object surface from masks: {reason}; the points' convex hull stands in for it")
@@ -114,7 +100,7 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
-    return SceneStart(scene, skipped, facts)
+    return SceneStart(scene, skipped)
 
 
 def _canonical_hands(

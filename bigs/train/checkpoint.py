@@ -15,10 +15,10 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail
-from bigs.models.scene import Scene
+from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop import NUMBERS, StageState
 
-FORMAT = "bigs-checkpoint-2"
+FORMAT = "bigs-checkpoint-3"
 FILE_NAME = "latest.safetensors"
 
 
@@ -26,7 +26,7 @@ class Position(NamedTuple):
     """Where to continue."""
 
     stage: int  # index of the stage to run next, or to continue
-    resume: dict[str, Any] | None  # for `loop.run_stage`; None at a stage's start
+    resume: dict[str, Any] | None  # what `StageState` holds; None at a stage's start
     report: dict[str, Any]  # as it was saved
 
 
@@ -49,6 +49,7 @@ def save_checkpoint(
         position |= {key: getattr(state, key) for key in NUMBERS}
         for index, moments in state.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
+        tensors |= {f"found.{name}": value for name, value in state.found.items()}
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     metadata = {
         "format": FORMAT,
@@ -107,6 +108,8 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
         isinstance(scene.object_splats, ObjectDetail) and len(scene.object_splats.shift) == count
     ):
         scene.object_splats = ObjectDetail(count)
+    if "scene.surface_verts" in tensors:
+        scene.replace_surface(ObjectSurface(tensors["scene.surface_verts"], tensors["scene.surface_faces"]))
     scene.load_state_dict(
         {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
     )
@@ -119,4 +122,7 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
             _, index, key = name.split(".")
             moments.setdefault(int(index), {})[key] = value
     resume = {key: position[key] for key in NUMBERS}
-    return Position(position["stage"], resume | {"moments": moments}, report)
+    found = {
+        name.removeprefix("found."): value for name, value in tensors.items() if name.startswith("found.")
+    }
+    return Position(position["stage"], resume | {"moments": moments, "found": found}, report)

@@ -104,13 +104,6 @@ def complete(
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 
 
-def with_points(start: ObjectStart, completion: Completion) -> ObjectStart:
-    """The start values with the added points and their colours."""
-    points = np.concatenate([start.points, completion.points])
-    colors = None if start.colors is None else np.concatenate([start.colors, completion.colors])
-    return start._replace(points=points, colors=colors)
-
-
 def _empty_space(carving: Carving, surface: SeenSurface, config: CompletionConfig) -> IsEmpty:
     """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
     grid = carving.hull

@@ -108,6 +108,19 @@ class PriorConfig:
 
 
 @dataclass(frozen=True)
+class CompletionStage:
+    """The object's symmetries complete it where it was never seen (see `completed_scene`).
+
+    With the prior off there is no such stage.
+    """
+
+    name: str = "object-completion"
+    step: Step = "single-subject"
+    # The clip's own frames may come to show so much worse; beyond that all is undone.
+    most_worsening: float = 0.005
+
+
+@dataclass(frozen=True)
 class GuidanceStage:
     """A diffusion prior completes the object where it was never seen (paper Eq. 7; see `guided`).
 
@@ -137,7 +150,7 @@ class GuidanceStage:
     damage: float = 0.02
 
 
-Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | GuidanceStage
+Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | CompletionStage | GuidanceStage
 
 
 @dataclass(frozen=True)

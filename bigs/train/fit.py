@@ -24,6 +24,7 @@ from bigs.train.background import unknown_occluders
 from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import (
+    CompletionStage,
     GraspStage,
     GuidanceStage,
     OptimizeStage,
@@ -34,8 +35,8 @@ from bigs.train.config import (
 )
 from bigs.train.evidence import EvidenceSource
 from bigs.train.grasps import find_grasps
-from bigs.train.guided_scene import guide_scene
 from bigs.train.loop import StageProgress, StageState, run_stage
+from bigs.train.prior_stages import run_completion, run_guidance, without_missing_prior
 from bigs.train.scale_search import search_object_scale
 from bigs.train.switches import without
 from bigs.types import Side
@@ -86,11 +87,11 @@ def fit(
     """
     report = FitReport()
     config, network_note = _without_missing_network(config, perceptual)
-    config, prior_note = _without_missing_prior(config, clip, denoiser)
+    config, prior_note = without_missing_prior(config, clip, denoiser)
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene, skipped, report.facts = build_scene(
+    scene, skipped = build_scene(
         clip,
         unknown,
         hand_models,
@@ -98,11 +99,10 @@ def fit(
         config.hand,
         config.object,
         config.lighting,
-        None if config.prior.kind == "off" else config.prior.completion,
     )
     report.skipped += [note for note in (network_note, prior_note) if note] + skipped
     report.seconds["start values"] = time.perf_counter() - began
-    digest = run_digest(clip, scene, config, perceptual)
+    digest = run_digest(clip, scene, config, perceptual, denoiser)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
     first = position.stage if position else 0
     if position:
@@ -130,6 +130,7 @@ def fit(
             continue
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
         began = time.perf_counter() - report.seconds.get(stage.name, 0.0)
+        continues = position.resume if position and index == first else None
         if isinstance(stage, ScaleSearchStage):
             factor, _, _ = search_object_scale(scene, stage, sources.touching(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
@@ -141,19 +142,15 @@ def fit(
         elif isinstance(stage, SplitStage):
             for text in _split(scene, stage):
                 listen({"event": "note", "stage": stage.name, "text": text})
-        elif isinstance(stage, GuidanceStage):
-            evidence = sources.evidence(_OBSERVED_AT)
-
-            def tell(step: int, loss: float, stage: GuidanceStage = stage, index: int = index) -> None:
-                progress = {"step": step, "steps": stage.steps, "loss": loss, "terms": {}, "seconds": 0.0}
-                listen({"event": "step", "stage": stage.name, "index": index, **progress})
-
-            done = guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, tell)
+        elif isinstance(stage, CompletionStage | GuidanceStage):
+            if isinstance(stage, CompletionStage):
+                done = run_completion(scene, stage, sources, config)
+            else:
+                done = run_guidance(scene, stage, index, sources, config, denoiser, continues, keep, listen)
             if done.skipped:
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
         else:
-            continues = position.resume if position and index == first else None
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
             if last.step < stage.steps:
                 report.skipped.append(
@@ -236,33 +233,13 @@ def _without_missing_network(config: RunConfig, network: VggWeights | None) -> t
     )
 
 
-# The size at which the guard over what was seen looks.
-_OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
-
-
-def _without_missing_prior(
-    config: RunConfig, clip: Clip, denoiser: Denoiser | None
-) -> tuple[RunConfig, str | None]:
-    """The configuration without the stages that need a denoiser, if there is none; what to tell the user."""
-    asking = [stage for stage in config.stages if isinstance(stage, GuidanceStage)]
-    if denoiser is not None:
-        return config, None if asking else "prior: weights were given, but no stage of this plan uses them"
-    rest = tuple(stage for stage in config.stages if not isinstance(stage, GuidanceStage))
-    note = (
-        "prior: no diffusion; --prior-weights turns it on, with a FILE of bigs prior train "
-        "or a FOLDER of Stable Diffusion"
-    )
-    wanted = config.prior.kind != "off" and clip.object is not None
-    return replace(config, stages=rest), note if wanted else None
-
-
 def _not_needed(stage: Stage, scene: Scene) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
     if isinstance(stage, ScaleSearchStage | GraspStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
-    if isinstance(stage, GuidanceStage):
+    if isinstance(stage, CompletionStage | GuidanceStage):
         return "the clip has no object" if scene.object_splats is None else None
     if isinstance(stage, SplitStage):
         return "the clip has no object" if scene.object_splats is None and not stage.hands else None
@@ -279,11 +256,21 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
     return None
 
 
-def run_digest(clip: Clip, scene: Scene, config: RunConfig, perceptual: VggWeights | None) -> str:
+def run_digest(
+    clip: Clip,
+    scene: Scene,
+    config: RunConfig,
+    perceptual: VggWeights | None,
+    denoiser: Denoiser | None,
+) -> str:
     """Identifies what a checkpoint belongs to: version, configuration, images, masks and start values."""
     # Of a network counts what is in it, not where it lies.
-    config = replace(config, perceptual_weights=())
-    text = json.dumps([bigs.__version__, clip.name, list(clip.frame_names), asdict(config)], sort_keys=True)
+    prior = replace(config.prior, weights="", controlnet="", token="", edge_weights="")
+    config = replace(config, perceptual_weights=(), prior=prior)
+    origin = None if denoiser is None else denoiser.fingerprint
+    text = json.dumps(
+        [bigs.__version__, clip.name, list(clip.frame_names), asdict(config), origin], sort_keys=True
+    )
     digest = hashlib.sha256(text.encode())
     for path in (*clip.image_paths, *clip.mask_paths):
         digest.update(path.read_bytes())

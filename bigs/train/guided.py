@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.spatial
@@ -27,10 +27,15 @@ from bigs.models.object_splats import CanonicalObject
 from bigs.raster import rasterization
 from bigs.raster.settings import RasterSettings
 from bigs.train.config import GuidanceStage
+from bigs.train.loop import StageState
 
 # Directions from which the object is looked at, before they are moved a little.
 _DIRECTIONS = 256
 _NEIGHBOURS = 8
+
+
+# Told the state after every step, and the loss.
+AfterStep = Callable[[StageState, float], None]
 
 
 class Coverage(NamedTuple):
@@ -92,7 +97,8 @@ def guide_object(
     settings: RasterSettings,
     image_error: Callable[[], float],
     seed: int = 0,
-    after_step: Callable[[int, float], None] = lambda step, loss: None,
+    resume: Mapping[str, Any] | None = None,
+    after_step: AfterStep = lambda state, loss: None,
 ) -> Guided:
     """Optimise what was not seen of the object in place by score distillation from virtual cameras.
 
@@ -100,7 +106,7 @@ def guide_object(
     seen part's error is measured before and after, and all is undone if it grew more than the stage allows.
 
     Args:
-        detail: the object's own Gaussians.
+        detail: the object's own Gaussians, as the stage found them.
         coverage: which of them were seen; some were not.
         orbit: where the virtual cameras stand.
         denoiser: the prior.
@@ -108,20 +114,14 @@ def guide_object(
         settings: of the renderer.
         image_error: the error of the pictures of what was seen, as the object is now.
         seed: of views, timesteps and noise.
-        after_step: told the steps done and the loss.
+        resume: steps done, moments, and what the Gaussians' parameters had become ("reached"), by name.
+        after_step: told the state after every step, and the loss.
 
     Raises:
         FloatingPointError: the prior's estimate is not finite.
     """
     sds = SdsConfig(stage.t_first, stage.t_last)
-    generator = torch.Generator().manual_seed(seed)
     weights = view_weights(coverage.by_direction, stage.well_seen)
-    kept = {name: value.detach().clone() for name, value in detail.state_dict().items()}
-    with torch.no_grad():
-        start = detail().means.clone()
-    unseen = ~coverage.seen
-    neighbours, spacing = _neighbours(start)
-    before = image_error()
     rates = {
         "shift": stage.lr_shift,
         "size": stage.lr_size,
@@ -129,12 +129,25 @@ def guide_object(
         "color": stage.lr_color,
     }
     parameters = {name: getattr(detail, name) for name in rates}
+    found = {name: value.detach().clone() for name, value in parameters.items()}
+    with torch.no_grad():
+        start = detail().means.clone()
+    unseen = ~coverage.seen
+    neighbours, spacing = _neighbours(start)
+    before = image_error()
     for parameter in parameters.values():
         parameter.requires_grad_(True)
     optimizer = torch.optim.Adam(
         [{"params": [parameters[name]], "lr": lr} for name, lr in rates.items()], betas=(0.9, 0.99)
     )
-    for step in range(stage.steps):
+    done = 0
+    if resume is not None:
+        done = resume["step"]
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
+        _fill(parameters, resume["reached"])
+    for step in range(done, stage.steps):
+        # A function of seed and step, so that a resumed run draws the same.
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
         directions = draw_directions(coverage.directions, weights, stage.views, generator)
         cameras = virtual_cameras(orbit, directions, stage.image_size)
         canonical = _freed(detail(), unseen)
@@ -155,15 +168,21 @@ def guide_object(
         for parameter in parameters.values():
             parameter.grad[coverage.seen] = 0.0
         optimizer.step()
-        after_step(step + 1, float(loss.detach()))
+        after_step(StageState.begun(step + 1, optimizer, found), float(loss.detach()))
     for parameter in parameters.values():
         parameter.requires_grad_(False)
     after = image_error()
     if after > (1.0 + stage.damage) * before:
-        detail.load_state_dict(kept)
+        _fill(parameters, found)
         return Guided(torch.zeros_like(start), before, after, True)
     with torch.no_grad():
         return Guided(detail().means - start, before, after, False)
+
+
+@torch.no_grad()
+def _fill(parameters: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    for name, parameter in parameters.items():
+        parameter.copy_(values[name])
 
 
 def _freed(canonical: CanonicalObject, free: Tensor) -> CanonicalObject:

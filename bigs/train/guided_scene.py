@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
-import numpy as np
 import torch
 
-from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.guidance.cameras import Orbit, make_orbit
 from bigs.guidance.denoiser import Denoiser
-from bigs.losses.photometric import masked_l1
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
+from bigs.train.completed_scene import CompletedScene
 from bigs.train.config import GuidanceStage
-from bigs.train.guided import Coverage, coverage_of, follow, guide_object
+from bigs.train.guided import AfterStep, Coverage, coverage_of, follow, guide_object
+from bigs.train.seen import frames_seen, guard_frames, image_error, object_views
 from bigs.train.step import Evidence
-from bigs.train.step import Step as LossStep
 
-# A Gaussian counts as seen when it shows in so many frames; poses are wrong by about so much, metres.
-_LEAST_FRAMES, _TOLERANCE = 3, 0.006
-# Frames on which the guard looks.
-_GUARD_FRAMES = 12
-
-
-class GuidedScene(NamedTuple):
-    """What there is to tell."""
-
-    skipped: str | None  # why nothing was changed
-    facts: dict[str, str]
+# A Gaussian counts as seen when it shows in so many frames: fewer may be a fault of mask or pose.
+_LEAST_FRAMES = 3
 
 
 @torch.no_grad()
@@ -39,16 +28,11 @@ def scene_coverage(scene: Scene, evidence: Evidence) -> tuple[Coverage, Orbit]:
     The front is where the clip's camera stood on average, and up is what was up in its pictures.
     """
     canonical = scene.object_splats()
-    pose = scene.object_frames(torch.arange(scene.n_frames))
-    # In the object's own units the camera's distance, not the object, changes with its size.
-    rotations, centers = pose.rotations, pose.centers / pose.scale
-    shown = evidence.targets.shares["object"] > 0.5
-    views = ObjectViews(shown.numpy(), evidence.targets.K.numpy(), rotations.numpy(), centers.numpy())
-    points, normals = canonical.means.numpy().astype(np.float64), canonical.normals.numpy()
-    frames = times_seen(views, points, normals, points, _TOLERANCE)
+    frames = frames_seen(canonical, object_views(scene, evidence))
     seen = torch.as_tensor(frames >= min(_LEAST_FRAMES, scene.n_frames))
-    up = -rotations[:, 1].mean(0)
-    towards = -(rotations.transpose(-1, -2) @ centers[..., None])[..., 0]
+    pose = scene.object_frames(torch.arange(scene.n_frames))
+    up = -pose.rotations[:, 1].mean(0)
+    towards = -(pose.rotations.transpose(-1, -2) @ pose.centers[..., None])[..., 0]
     front = torch.nn.functional.normalize(towards, dim=-1).mean(0)
     return coverage_of(canonical.normals, seen), make_orbit(canonical.means, up, front)
 
@@ -59,8 +43,9 @@ def guide_scene(
     denoiser: Denoiser,
     stage: GuidanceStage,
     seed: int,
-    after_step: Callable[[int, float], None] = lambda step, loss: None,
-) -> GuidedScene:
+    resume: Mapping[str, Any] | None = None,
+    after_step: AfterStep = lambda state, loss: None,
+) -> CompletedScene:
     """Let a prior complete the scene's object, in place; its surface follows its Gaussians.
 
     Args:
@@ -69,31 +54,34 @@ def guide_scene(
         denoiser: the prior.
         stage: see that class.
         seed: of views, timesteps and noise.
-        after_step: told the steps done and the loss.
+        resume: of an interrupted stage, as `checkpoint.load_checkpoint` returns it.
+        after_step: told the state after every step, and the loss.
     """
     scene.requires_grad_(False)
     if not isinstance(scene.object_splats, ObjectDetail):
         scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
     detail = scene.object_splats
+    if resume is not None:
+        # What was seen, and how well it showed, is told by the object as the stage found it.
+        resume = {**resume, "reached": {name: getattr(detail, name).clone() for name in resume["found"]}}
+        detail.load_state_dict({**detail.state_dict(), **resume["found"]})
     coverage, orbit = scene_coverage(scene, evidence)
     facts = {"object seen before the prior": f"{coverage.share:.0%} of its Gaussians"}
     if coverage.share >= stage.enough or not (coverage.by_direction < stage.well_seen).any():
-        return GuidedScene(f"{coverage.share:.0%} of the object was seen", facts)
-    frames = torch.linspace(0, scene.n_frames - 1, min(_GUARD_FRAMES, scene.n_frames)).round().long()
+        return CompletedScene(f"{coverage.share:.0%} of the object was seen", facts)
+    frames = guard_frames(scene.n_frames)
 
-    @torch.no_grad()
-    def image_error() -> float:
-        step = LossStep(scene, evidence, ("object",), scene.canonical(("object",)), frames)
-        return float(masked_l1(step.alone("object").colors, step.images, step.share("object")))
+    def error() -> float:
+        return image_error(scene, evidence, ("object",), frames)
 
     with torch.no_grad():
         means = detail().means.clone()
     done = guide_object(
-        detail, coverage, orbit, denoiser, stage, evidence.settings, image_error, seed, after_step
+        detail, coverage, orbit, denoiser, stage, evidence.settings, error, seed, resume, after_step
     )
     change = f"{done.after / max(done.before, 1e-12) - 1.0:+.1%}"
     if done.rolled_back:
-        return GuidedScene(f"undone, since what was seen would show worse ({change} error)", facts)
+        return CompletedScene(f"undone, since what was seen would show worse ({change} error)", facts)
     with torch.no_grad():
         scene.surface_verts.copy_(follow(scene.surface_verts, means, done.moved))
     moved = 1e3 * float(done.moved[~coverage.seen].norm(dim=-1).mean())
@@ -102,4 +90,4 @@ def guide_scene(
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
         f"error of what was seen {change}"
     )
-    return GuidedScene(None, facts)
+    return CompletedScene(None, facts)

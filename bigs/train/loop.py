@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -39,6 +39,14 @@ class StageState(NamedTuple):
     best_step: int
     smoothed: float
     retreats: int  # how often the stage went back after something that was not finite
+    found: Mapping[str, Tensor]  # what the stage began from, by name, where it has to know that
+
+    @classmethod
+    def begun(
+        cls, step: int, optimizer: torch.optim.Optimizer, found: Mapping[str, Tensor] | None = None
+    ) -> StageState:
+        """After `step` steps, of whose losses nothing is known yet."""
+        return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {})
 
 
 # The parts of `StageState` that are plain numbers.
@@ -113,7 +121,7 @@ def run_stage(
     if "perceptual" in stage.weights and evidence.perceptual is None:
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     optimizer = make_optimizer(scene, stage.lrs)
-    state = StageState(0, optimizer, float("inf"), 0, float("nan"), 0)
+    state = StageState.begun(0, optimizer)
     if resume is not None:
         optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
         state = state._replace(**{key: resume[key] for key in NUMBERS})

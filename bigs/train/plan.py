@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from bigs.checks import InputError
 from bigs.train.config import (
+    CompletionStage,
     GraspStage,
     GuidanceStage,
     OptimizeStage,
@@ -30,6 +31,7 @@ _LEAST_OF_STAGE: Mapping[type, Mapping[str, float]] = {
     ScaleSearchStage: {"candidates": 1, "image_size": 0, "frames": 1},
     GraspStage: {"speed": 0.0, "least": 2, "slack": 0.0, "bridge": 0, "longest_move": 0},
     SplitStage: {"parts": 1, "least_opacity": 0.0},
+    CompletionStage: {"most_worsening": 0.0},
     GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0},
 }
 # What the renderer is compiled for.

@@ -8,6 +8,7 @@ from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.config import (
+    CompletionStage,
     GraspStage,
     GuidanceStage,
     OptimizeStage,
@@ -199,6 +200,7 @@ FAST = RunConfig(
         SplitStage(),
         _JOINT,
         _DETAIL,
+        CompletionStage(),
         GuidanceStage(),
     ),
 )
@@ -218,6 +220,7 @@ DEMO = replace(
         replace(_REGRASP, steps=60),
         SplitStage(),
         replace(_JOINT, steps=110),
+        CompletionStage(),
         GuidanceStage(steps=150),
     ),
 )
@@ -241,6 +244,7 @@ FULL = replace(
         SplitStage(),
         replace(_JOINT, steps=500),
         replace(_DETAIL, steps=900, image_size=640),
+        CompletionStage(),
         GuidanceStage(steps=600),
     ),
 )
@@ -264,6 +268,7 @@ SMOKE = replace(
         SplitStage(),
         replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
         replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),
+        CompletionStage(),
         GuidanceStage(steps=4, views=2),
     ),
 )
@@ -313,6 +318,7 @@ PAPER = RunConfig(
             frames_per_step=1,
             final_lr=1.0,
         ),
+        CompletionStage(),
         GuidanceStage(steps=1000),
         OptimizeStage(
             name="translations",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from bigs.checks import InputError
 from bigs.train.config import (
+    CompletionStage,
     GraspStage,
     GuidanceStage,
     OptimizeStage,
@@ -76,13 +77,13 @@ def _less(values: dict[str, float], names: Iterable[str]) -> dict[str, float]:
 def _keep(
     config: RunConfig,
     change: Callable[[OptimizeStage], OptimizeStage] = lambda stage: stage,
-    leave_out: type[Stage] | None = None,
+    leave_out: type[Stage] | tuple[type[Stage], ...] = (),
 ) -> RunConfig:
     """The same with changed stages, without those of a kind and those that have nothing left to do."""
     stages = [
         change(stage) if isinstance(stage, OptimizeStage) else stage
         for stage in config.stages
-        if leave_out is None or not isinstance(stage, leave_out)
+        if not isinstance(stage, leave_out)
     ]
     idle = [
         stage for stage in stages if isinstance(stage, OptimizeStage) and not (stage.lrs and stage.weights)
@@ -101,6 +102,10 @@ def _all_of(*steps: Callable[[RunConfig], RunConfig]) -> Callable[[RunConfig], R
 
 def _smooth(config: RunConfig) -> RunConfig:
     return replace(config, initial=replace(config.initial, smooth_hands=0.0))
+
+
+def _no_prior(config: RunConfig) -> RunConfig:
+    return replace(_keep(config, leave_out=(CompletionStage, GuidanceStage)), prior=PriorConfig())
 
 
 def _object_smooth(config: RunConfig) -> RunConfig:
@@ -150,7 +155,7 @@ _INGREDIENTS = {
     ),
     "prior": Switch(
         "what completes the object where it was never seen",
-        lambda config: replace(_keep(config, leave_out=GuidanceStage), prior=PriorConfig()),
+        _no_prior,
     ),
     "smooth": Switch(
         "the hands' motion: the smoothing of their estimates, L_smt, acceleration of the joints",

@@ -17,11 +17,9 @@ from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
-from bigs.train.build import build_scene
 from bigs.train.carving import Carving, carve
 from bigs.train.completion import Completion, CompletionConfig, complete
 from bigs.train.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
-from bigs.train.presets import SMOKE
 from bigs.types import HandObjectTrajectory, Side
 
 INITIAL = InitialConfig(surface_resolution=56)
@@ -81,33 +79,6 @@ def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, Carving, ObjectSt
     _, carving, start = one_side
     found = complete(carving, start, INITIAL, CompletionConfig(enough=0.05))
     assert not found.symmetries and "of the object's surface was seen" in str(found)
-
-
-def test_a_scene_says_what_was_seen_and_completed(
-    one_side: tuple[Clip, Carving, ObjectStart],
-    both_hands: dict[Side, HandModel],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """With completion the scene starts from the completed surface; without, from what it was before."""
-    clip, carving, _ = one_side
-    added = np.array([[0.0, 0.0, 0.3]])
-
-    def completed(*arguments: object) -> Completion:
-        values = carving.hull.values + 0.002
-        grid = DistanceGrid(values, carving.hull.origin, carving.hull.spacing)
-        return Completion(grid, 0.4321, [object()], added, np.ones((1, 3)))  # type: ignore[list-item]
-
-    monkeypatch.setattr("bigs.train.build.complete", completed)
-    monkeypatch.setattr("bigs.train.completion.Completion.__str__", lambda self: "as told")
-    built = [
-        build_scene(
-            clip, nothing_hides(clip), both_hands, INITIAL, SMOKE.hand, SMOKE.object, False, completion
-        )
-        for completion in (None, CompletionConfig())
-    ]
-    assert built[0].facts == {}
-    assert built[1].facts == {"object seen": "43% of its surface", "object completed": "as told"}
-    assert built[0].scene.object_surface.verts.shape != built[1].scene.object_surface.verts.shape
 
 
 def test_the_description_counts_kinds() -> None:

@@ -1,0 +1,152 @@
+"""Completion by symmetry as a stage: poses and what shows stay, the rest is replaced, damage is undone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from limited_view import limited_view
+
+from bigs.data.base import Clip
+from bigs.data.ground_truth import load_ground_truth
+from bigs.data.hold import load_hold
+from bigs.data.synthetic import make_clip
+from bigs.hand import HandModel
+from bigs.metrics.align import similarity_icp
+from bigs.metrics.shape import ShapeScore
+from bigs.models.scene import Scene
+from bigs.train.completion import CompletionConfig
+from bigs.train.config import CompletionStage, PriorConfig, RunConfig, SplitStage
+from bigs.train.evidence import EvidenceSource
+from bigs.train.fit import FitReport, fit
+from bigs.train.initial import InitialConfig
+from bigs.train.presets import SMOKE
+from bigs.train.seen import image_error, weights_in_pictures
+from bigs.types import HandObjectTrajectory, Side
+
+PLAN = replace(
+    SMOKE,
+    prior=PriorConfig("symmetry"),
+    initial=InitialConfig(surface_resolution=56),
+    object=replace(SMOKE.object, n_gaussians=1500),
+    stages=(SplitStage(parts=1), CompletionStage()),
+)
+
+
+@pytest.fixture(scope="module")
+def bottle(
+    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
+) -> tuple[Clip, HandObjectTrajectory]:
+    """A third of a turn of a bottle, and the truth."""
+    folder = tmp_path_factory.mktemp("bottle") / "clip"
+    path = make_clip(folder, hand_models=both_hands, frames=36, width=240, height=180, seed=2)
+    truth = load_ground_truth(path)
+    return limited_view(load_hold(path), truth, range(12)), truth
+
+
+@pytest.fixture(scope="module")
+def plain(
+    bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
+) -> tuple[Scene, FitReport]:
+    return fit(bottle[0], both_hands, replace(PLAN, prior=PriorConfig("off")))
+
+
+@pytest.fixture(scope="module")
+def completed(
+    bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
+) -> tuple[Scene, FitReport]:
+    return fit(bottle[0], both_hands, PLAN)
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], names: tuple[str, ...]) -> bool:
+    """Whether all tensors whose names begin so are the same bits."""
+    chosen = [name for name in a if name.startswith(names)]
+    return bool(chosen) and all(torch.equal(a[name], b[name]) for name in chosen)
+
+
+def shape(scene: Scene, truth: HandObjectTrajectory) -> ShapeScore:
+    surface = scene.object_surface
+    return similarity_icp(
+        surface.verts.numpy(), truth.object_verts[0], surface.faces.numpy(), truth.object_faces
+    ).score
+
+
+def test_off_there_is_no_such_stage(plain: tuple[Scene, FitReport]) -> None:
+    assert CompletionStage().name not in plain[1].seconds
+    assert plain[1].facts == {} and plain[1].skipped == []
+
+
+def test_the_shape_gains_and_nothing_that_was_seen_changes(
+    plain: tuple[Scene, FitReport],
+    completed: tuple[Scene, FitReport],
+    bottle: tuple[Clip, HandObjectTrajectory],
+) -> None:
+    before, after = plain[0].state_dict(), completed[0].state_dict()
+    assert "found" in completed[1].facts["object completed"]
+    assert "%" in completed[1].facts["object seen"]
+    assert same(before, after, ("hand_poses", "object_poses", "betas", "grasps", "hand_splats", "lighting"))
+    scores = [shape(scene, bottle[1]) for scene in (plain[0], completed[0])]
+    assert scores[1].chamfer.squared < 0.8 * scores[0].chamfer.squared
+    assert scores[1].f5 > scores[0].f5 and scores[1].f10 >= scores[0].f10
+    # Gaussians: those that show are left to the last bit, in front of the new ones; of the rest none is.
+    old, new = plain[0].object_splats, completed[0].object_splats
+    left = int((new.base_means[:, None] == old.base_means[None]).all(-1).any(1).sum())
+    assert 0.3 * len(old.shift) < left < len(old.shift) < len(new.shift) + len(old.shift) - left
+    assert not any(parameter.requires_grad for parameter in completed[0].parameters())
+
+
+def test_what_is_added_shows_in_no_frame(
+    plain: tuple[Scene, FitReport],
+    completed: tuple[Scene, FitReport],
+    bottle: tuple[Clip, HandObjectTrajectory],
+) -> None:
+    clip = bottle[0]
+    sources = EvidenceSource(clip, np.zeros((len(clip), 180, 240), dtype=bool), completed[0], PLAN, None)
+    evidence = sources.evidence(replace(SMOKE.stages[0], image_size=240))
+    known = plain[0].object_splats.base_means
+    new = ~(completed[0].object_splats.base_means[:, None] == known[None]).all(-1).any(1)
+    assert int(new.sum()) > 100
+    assert float(weights_in_pictures(completed[0], evidence)[new].max()) < 0.05
+    everything = torch.arange(len(clip))
+    errors = [image_error(scene, evidence, scene.entities, everything) for scene in (plain[0], completed[0])]
+    assert errors[1] < 1.005 * errors[0]
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        replace(PLAN, prior=PriorConfig("symmetry", completion=CompletionConfig(enough=0.05))),
+        replace(PLAN, stages=(SplitStage(parts=1), CompletionStage(most_worsening=-1.0))),
+    ],
+    ids=["seen", "worse"],
+)
+def test_where_it_does_not_help_the_scene_is_as_if_it_were_off(
+    plan: RunConfig,
+    bottle: tuple[Clip, HandObjectTrajectory],
+    plain: tuple[Scene, FitReport],
+    both_hands: dict[Side, HandModel],
+) -> None:
+    scene, report = fit(bottle[0], both_hands, plan)
+    assert len(report.skipped) == 2 and report.skipped[1].startswith("object-completion: ")
+    before, after = plain[0].state_dict(), scene.state_dict()
+    assert before.keys() == after.keys()
+    assert same(before, after, ("",))
+
+
+def test_a_completed_object_comes_back_from_its_checkpoint(
+    bottle: tuple[Clip, HandObjectTrajectory],
+    completed: tuple[Scene, FitReport],
+    both_hands: dict[Side, HandModel],
+    tmp_path: Path,
+) -> None:
+    """Though it has other Gaussians, vertices and faces than the scene that a resumed run begins with."""
+    fit(bottle[0], both_hands, PLAN, checkpoints=tmp_path)
+    events: list[dict[str, Any]] = []
+    scene, report = fit(bottle[0], both_hands, PLAN, checkpoints=tmp_path, resume=True, listen=events.append)
+    assert not any(event["event"] == "stage" for event in events)
+    assert same(completed[0].state_dict(), scene.state_dict(), ("",))
+    assert report.facts == completed[1].facts
