@@ -32,7 +32,7 @@ def build(
     torch.manual_seed(0)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     hand = replace(SMOKE.hand, shape_error=shape_error)
-    scene, skipped, _ = build_scene(clip, nothing, hands, AS_GIVEN, hand, SMOKE.object, True)
+    scene, skipped = build_scene(clip, nothing, hands, AS_GIVEN, hand, SMOKE.object, True)
     return scene, skipped
 
 
