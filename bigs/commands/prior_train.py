@@ -126,8 +126,16 @@ def _digest(files: list[Path], config: PixelTrainingConfig, views: int, up: str)
     return digest.hexdigest()[:16]
 
 
-def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
-    """A mesh covered with flat Gaussians, z up, within a ball of 10 cm.
+class Shape(NamedTuple):
+    """A triangle mesh with a colour at each vertex."""
+
+    verts: np.ndarray  # [V, 3] metres
+    faces: np.ndarray  # [F, 3]
+    colors: np.ndarray  # [V, 3] in [0, 1]
+
+
+def read_shape(file: Path, up: str) -> Shape:
+    """A mesh from a file, its axis `up` turned to z, as large as a ball of 10 cm radius holds.
 
     Raises:
         InputError: no triangle mesh.
@@ -142,12 +150,16 @@ def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
     verts = verts - 0.5 * (verts.min(0) + verts.max(0))
     verts = 0.1 * verts / np.linalg.norm(verts, axis=-1).max()
     verts = np.roll(verts, 2 - "xyz".index(up), axis=-1)
-    points, normals = sample_surface(verts, np.asarray(mesh.faces), _GAUSSIANS)
     visual: Any = mesh.visual
     if isinstance(visual, trimesh.visual.TextureVisuals):
         visual = visual.to_color()
-    colors = np.asarray(visual.vertex_colors)[:, :3] / 255.0
-    nearest = scipy.spatial.cKDTree(verts).query(points)[1]
+    return Shape(verts, np.asarray(mesh.faces), np.asarray(visual.vertex_colors)[:, :3] / 255.0)
+
+
+def cover(shape: Shape) -> CanonicalObject:
+    """A mesh covered with flat Gaussians."""
+    points, normals = sample_surface(shape.verts, shape.faces, _GAUSSIANS)
+    nearest = scipy.spatial.cKDTree(shape.verts).query(points)[1]
     spacing = point_spacing(points)
     as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
     scales = _SPREAD * spacing[:, None] * np.array([1.0, 1.0, _FLATNESS])
@@ -158,7 +170,7 @@ def mesh_gaussians(file: Path, up: str) -> CanonicalObject:
         matrix_to_quat(as_tensor(frames_from_normals(normals))),
         as_tensor(scales),
         torch.full((len(means),), 0.95),
-        as_tensor(colors[nearest]),
+        as_tensor(shape.colors[nearest]),
         as_tensor(normals),
         torch.zeros(len(means), N_PARTS),  # nothing shades it
     )
@@ -169,7 +181,7 @@ def mesh_pictures(file: Path, views: int, up: str, seed: int) -> tuple[Tensor, T
 
     The front is drawn for each mesh: in a reconstruction it is the side that the clip saw, whichever it is.
     """
-    whole = mesh_gaussians(file, up)
+    whole = cover(read_shape(file, up))
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0.0, 2.0 * np.pi)
     front = torch.tensor([np.cos(angle), np.sin(angle), 0.0], dtype=torch.float32)

@@ -102,6 +102,41 @@ def test_a_finished_stage_is_not_lost_on_resume(
     torch.testing.assert_close(again.object_surface.verts, first.object_surface.verts, rtol=0, atol=0)
 
 
+class _Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("at", [3, 5])
+def test_an_interrupted_stage_goes_on_at_its_step(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, tmp_path: Path, at: int
+) -> None:
+    """And ends in the same bits; the weights may have moved meanwhile, but not changed."""
+    stage = replace(STAGE, steps=6, damage=1e9)
+    plan = replace(PLAN, stages=(SplitStage(parts=1), stage), checkpoint_every=2)
+    whole, report = run(one_side, both_hands, plan, prior)
+
+    def kill(event: dict[str, object]) -> None:
+        if event["event"] == "step" and event["step"] == at:
+            raise _Killed
+
+    with pytest.raises(_Killed):
+        run(one_side, both_hands, plan, prior, checkpoints=tmp_path, listen=kill)
+    torch.manual_seed(1)
+    other = PixelDenoiser(PixelNet(PixelConfig(width=16, embedding=32)))
+    with pytest.raises(InputError, match="found one of another run"):
+        run(one_side, both_hands, plan, other, checkpoints=tmp_path, resume=True)
+    events: list[dict[str, object]] = []
+    moved = replace(plan, prior=replace(plan.prior, weights="elsewhere.safetensors"))
+    again, told = run(
+        one_side, both_hands, moved, prior, checkpoints=tmp_path, resume=True, listen=events.append
+    )
+    first = 2 * ((at - 1) // 2)
+    assert [event["step"] for event in events if event["event"] == "step"] == [*range(first + 1, 7)]
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=0)
+    assert told.facts == report.facts
+
+
 def test_what_the_options_mean(tmp_path: Path) -> None:
     file = str(tmp_path / "prior.safetensors")
     nothing = dict.fromkeys(("weights", "controlnet", "token", "edge_weights"), "")
