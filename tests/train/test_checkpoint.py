@@ -197,7 +197,7 @@ def test_a_checkpoint_of_another_run_is_refused(
     if what == "seed":
         config = replace(config, seed=1)
     elif what == "a rate":
-        config.stages[-2].lrs["object.ray"] *= 2
+        config.stages[-3].lrs["object.ray"] *= 2
     elif what == "name":
         clip = replace(clip, name="other")
     elif what == "frame names":
@@ -291,7 +291,7 @@ def test_an_interrupted_runs_report_is_whole(
 
 def test_another_format_is_named(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:
     save_file({"x": torch.zeros(1)}, tmp_path / FILE_NAME)
-    with pytest.raises(InputError, match="expected format bigs-checkpoint-2, found None"):
+    with pytest.raises(InputError, match="expected format bigs-checkpoint-3, found None"):
         load_checkpoint(tmp_path, cube_scene(both_hands), "digest")
 
 
