@@ -118,7 +118,7 @@ def evaluate_run(
     novel = plan.novel or _own_novel(clip_path)
     if novel is not None:
         listen(f"{run.name}: held-back views")
-        result |= novel_scores(playback, novel, distance)
+        result |= novel_scores(playback, novel, distance, result.get("clip_scale"))
     if distance is None:
         remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")
     path = run / METRICS

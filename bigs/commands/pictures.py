@@ -11,7 +11,7 @@ import torch
 from bigs.commands.rendering import render_frame, render_input_view
 from bigs.data.base import Clip
 from bigs.data.novel import load_novel_views
-from bigs.metrics.picture import NOVEL, Distance, picture_scores
+from bigs.metrics.picture import NOVEL, NOVEL_SCALED, Distance, picture_scores
 from bigs.models.playback import Playback
 
 
@@ -24,21 +24,35 @@ def frame_scores(clip: Clip, playback: Playback, distance: Distance | None = Non
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
-def novel_scores(playback: Playback, folder: Path, distance: Distance | None = None) -> dict[str, float]:
+def novel_scores(
+    playback: Playback, folder: Path, distance: Distance | None = None, scale: float | None = None
+) -> dict[str, float]:
     """Mean image scores of held-back views, under the keys of novel views.
+
+    Args:
+        playback: the reconstruction.
+        folder: see `load_novel_views`.
+        distance: see `picture_scores`.
+        scale: what the clip is multiplied by, about its camera's centre, to be as large as the truth; None
+            gives no scores of the scaled clip.
 
     Raises:
         InputError: the views are not as they should be.
     """
-    rows = []
-    for view in load_novel_views(folder, len(playback)):
-        viewmat, K = (torch.as_tensor(matrix, dtype=torch.float32) for matrix in (view.viewmat, view.K))
-        color, _ = render_frame(playback, view.frame_index, viewmat, K, *view.size)
-        rows.append(picture_scores(color, view.image() / 255.0, view.mask() != 0, distance))
-    return {
-        f"{NOVEL}{key}": value
-        for key, value in means({key: np.array([row[key] for row in rows]) for key in rows[0]}).items()
-    }
+    views = load_novel_views(folder, len(playback))
+    sizes = {NOVEL: 1.0} if scale is None else {NOVEL: 1.0, NOVEL_SCALED: scale}
+    scores: dict[str, float] = {}
+    for prefix, size in sizes.items():
+        rows = []
+        for view in views:
+            viewmat, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (view.viewmat, view.K))
+            # A clip that grows and a camera that stays see what a clip that stays and a nearer camera see.
+            viewmat[:3, 3] /= size
+            color, _ = render_frame(playback, view.frame_index, viewmat, K, *view.size)
+            rows.append(picture_scores(color, view.image() / 255.0, view.mask() != 0, distance))
+        columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        scores |= {f"{prefix}{key}": value for key, value in means(columns).items()}
+    return scores
 
 
 def means(columns: Mapping[str, np.ndarray]) -> dict[str, float]:

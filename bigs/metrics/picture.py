@@ -28,10 +28,12 @@ PICTURE_METRICS: dict[str, Metric] = {
     "lpips_foreground": Metric("LPIPS of the foreground", "", "lower"),
     "lpips_full": Metric("LPIPS, whole frame", "", "lower", detail=True),
 }
-# The same of views that the reconstruction never saw.
-NOVEL = "novel_"
+# The same of views that the reconstruction never saw: as it is, and after the one scale per clip that one
+# camera cannot see.
+NOVEL, NOVEL_SCALED = "novel_", "novel_scaled_"
 PICTURE_METRICS |= {
-    f"{NOVEL}{key}": Metric(f"{metric.paper}, novel views", metric.unit, metric.better, metric.detail)
+    f"{prefix}{key}": Metric(f"{metric.paper}, {views}", metric.unit, metric.better, metric.detail)
+    for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, scaled clip"))
     for key, metric in PICTURE_METRICS.items()
 }
 ALL_METRICS = METRICS | PICTURE_METRICS

@@ -17,6 +17,8 @@ from small_vgg import lpips_channels, torchvision_state
 
 from bigs.commands.evaluation import Evaluation, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.paper_tables import beside_paper
+from bigs.commands.pictures import novel_scores
+from bigs.commands.rendering import render_frame
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_annotation
 from bigs.data.ho3d import CV_FROM_GL
@@ -24,6 +26,7 @@ from bigs.data.moving import in_world
 from bigs.data.writers import write_arctic, write_ho3d
 from bigs.hand import HandModel
 from bigs.metrics.picture import ALL_METRICS
+from bigs.models.playback import load_playback
 from bigs.types import Side
 
 pytestmark = pytest.mark.slow
@@ -158,6 +161,29 @@ def test_a_held_back_view_from_the_clips_own_camera(run: Path, tiny: Clip, tmp_p
     np.savez(tmp_path / "novel" / "cameras.npz", **(arrays | {"frame": np.array([7, 12])}))
     with pytest.raises(ValueError, match="frame: expected times from 0 to 11, found 7 to 12"):
         evaluate_run(run, EvaluationPlan(novel=tmp_path / "novel"))
+
+
+def test_held_back_views_of_a_clip_of_another_size(run: Path, tiny: Clip, tmp_path: Path) -> None:
+    """A clip of half the size, seen by a camera half as far from the clip's, looks the same."""
+    playback = load_playback(run / "scene.safetensors")
+    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    away = np.array([0.5, 0.0, 0.6])
+    view, _ = render_frame(
+        playback,
+        3,
+        torch.tensor(np.block([[turned, away[:, None]], [np.zeros(3), np.ones(1)]]), dtype=torch.float32),
+        torch.tensor(tiny.K, dtype=torch.float32),
+        tiny.width,
+        tiny.height,
+    )
+    for part, pixels in (("image", (255 * view.clip(0, 1)).round()), ("mask", 50 * (view.sum(-1) > 0))):
+        (tmp_path / part).mkdir()
+        Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / part / "0000.png")
+    same = {"K": tiny.K[None], "R": turned[None], "frame": np.array([3]), "wh": [tiny.width, tiny.height]}
+    np.savez(tmp_path / "cameras.npz", **same, t=2.0 * away[None])
+    scores = novel_scores(playback, tmp_path, scale=2.0)
+    assert scores["novel_scaled_psnr_foreground"] > 50.0 > scores["novel_psnr_foreground"]
+    assert not any(key.startswith("novel_scaled_") for key in novel_scores(playback, tmp_path))
 
 
 def test_lpips_needs_both_files(run: Path, call: Callable[..., Answer], tmp_path: Path) -> None:
