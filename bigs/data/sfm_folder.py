@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
+from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.fields import array_field, mapping_field, read_json, read_npz, require
 from bigs.data.hold import RADIUS_PER_SHIFT, shift_before

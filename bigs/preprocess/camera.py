@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from bigs.checks import InputError
+from bigs.colmap import pycolmap
 from bigs.data.arctic import camera_of_images
 from bigs.preprocess.source import Source
 

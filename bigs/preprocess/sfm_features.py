@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 from PIL import Image
+
+from bigs.colmap import pycolmap
 
 # Pixels of surroundings that a crop keeps, so that features at the object's border have their full patch.
 _MARGIN = 12

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import pycolmap
 
+from bigs.colmap import pycolmap
 from bigs.preprocess.sfm_features import FrameFeatures, quiet_colmap
 
 
