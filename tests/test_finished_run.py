@@ -20,14 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
-from bigs.train.config import GuidanceStage, OptimizeStage
+from bigs.train.config import CompletionStage, GuidanceStage, OptimizeStage
 from bigs.train.presets import PRESETS
 from bigs.types import ENTITIES, Side
 
 pytestmark = pytest.mark.slow
 
 # The stages of a run without a diffusion prior.
-UNGUIDED = [stage for stage in PRESETS["smoke"].stages if not isinstance(stage, GuidanceStage)]
+UNGUIDED = [
+    stage for stage in PRESETS["smoke"].stages if not isinstance(stage, CompletionStage | GuidanceStage)
+]
 
 
 @pytest.fixture(scope="module")

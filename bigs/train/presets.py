@@ -74,7 +74,7 @@ _CONTACT = replace(
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
-    steps=80,
+    steps=60,
     lrs={
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
@@ -96,7 +96,7 @@ _APPEARANCE = OptimizeStage(
 _REGRASP = OptimizeStage(
     name="regrasp",
     step="single-subject",
-    steps=120,
+    steps=90,
     lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
     weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002},
     image_size=160,
@@ -140,7 +140,6 @@ _JOINT = OptimizeStage(
     weights={
         "image": 4.0,
         "mse": 30.0,
-        "ssim": 0.8,
         "mask": 0.5,
         "labels": 0.5,
         "silhouette": 4.0,
@@ -161,7 +160,7 @@ _JOINT = OptimizeStage(
 )
 
 # The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.
-# Without SSIM and the hands' silhouettes, which would take more time there than all the rest.
+# Without the hands' silhouettes, which would take more time there than they are worth.
 _DETAIL = replace(
     _JOINT,
     name="detail",
@@ -179,7 +178,7 @@ _DETAIL = replace(
         "object.orient": 0.0007,
         "object.ray": 0.0002,
     },
-    weights={name: weight for name, weight in _JOINT.weights.items() if name not in ("ssim", "silhouette")},
+    weights={name: weight for name, weight in _JOINT.weights.items() if name != "silhouette"},
     image_size=480,
     frames_per_step=8,
 )
