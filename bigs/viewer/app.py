@@ -50,7 +50,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host=host, port=port, label=stage.title, verbose=False)
         self._stage = stage
-        self._wake, self._closing = threading.Event(), threading.Event()
+        self._wake, self._closing, self._ended = threading.Event(), threading.Event(), threading.Event()
         self._failure: Exception | None = None
         self._splats: dict[str, Any] = {}
         self._meshes: dict[str, Any] = {}
@@ -69,6 +69,7 @@ class Viewer:
     def close(self) -> None:
         self._closing.set()
         self._wake.set()
+        self._ended.wait()
         self._painter.join()
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
@@ -83,7 +84,9 @@ class Viewer:
 
     def wait(self) -> None:
         """Serve until interrupted, or until drawing fails, which is then raised here."""
-        self._painter.join()
+        # Not join: before Python 3.13 an interrupted join takes the thread for ended, and an interpreter that
+        # then ends while the thread still draws aborts.
+        self._ended.wait()
         if self._failure is not None:
             raise self._failure
 
@@ -110,7 +113,8 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui, stage = self._server.gui, self._stage
-        gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         self._frame: Any = None
         self._playing: Any = None
         if stage.frames > 1:
@@ -158,6 +162,8 @@ class Viewer:
             self._paint_on()
         except Exception as error:
             self._failure = error
+        finally:
+            self._ended.set()
 
     def _paint_on(self) -> None:
         frame, due = 0, time.monotonic()

@@ -1,0 +1,47 @@
+"""What an interrupt leaves behind: no thread that still draws, which would abort the interpreter's end."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="needs the extra 'viewer'")
+
+from bigs.viewer.app import Viewer
+from bigs.viewer.stage import Pose, Stage, Subject
+
+
+def test_an_interrupted_viewer_closes_when_its_drawing_has_ended() -> None:
+    drawing, ended = threading.Event(), threading.Event()
+
+    def show(frame: int, pose: Pose) -> Mapping[str, Subject]:
+        drawing.set()
+        # Longer than the interrupt and the close take.
+        time.sleep(1.0)
+        ended.set()
+        return {}
+
+    stage = Stage("slow", 1, np.eye(3), 16, 16, np.array([0.0, 0.0, 0.5]), {}, show)
+    with Viewer(stage, port=0) as viewer:
+        assert drawing.wait(10)
+        main = threading.main_thread().ident
+        assert main is not None
+        threading.Timer(0.2, signal.pthread_kill, (main, signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            viewer.wait()
+        assert not ended.is_set()
+    assert ended.is_set()
+
+
+def test_what_fails_while_drawing_ends_the_wait() -> None:
+    def show(frame: int, pose: Pose) -> Mapping[str, Subject]:
+        raise RuntimeError("nothing to show")
+
+    stage = Stage("broken", 1, np.eye(3), 16, 16, np.array([0.0, 0.0, 0.5]), {}, show)
+    with Viewer(stage, port=0) as viewer, pytest.raises(RuntimeError, match="nothing to show"):
+        viewer.wait()
