@@ -1,23 +1,62 @@
 """The one place where rotations change form. Matrices act on column vectors; quaternions are w x y z.
 
-Axis-angle and quaternion conversions are kornia's, whose gradients are finite at the identity and at pi.
+The two conversions that every step of an optimisation makes many times are written as few operations on small
+tensors, since each costs as much as its arithmetic; the others are kornia's. Gradients are finite at the
+identity and at pi.
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
 from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
     quaternion_to_rotation_matrix,
     rotation_matrix_to_axis_angle,
-    rotation_matrix_to_quaternion,
 )
 from torch import Tensor
 
+# v @ _CROSS is the matrix, row by row, that multiplies like v x.
+_CROSS = torch.tensor(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
+    dtype=torch.float32,
+)
+# 1 + vec(R) @ _OUTER on the diagonal, and the same without 1 off it, is 4 q q^T for the quaternion q of R.
+_OUTER = torch.tensor(
+    [
+        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1],
+        [0, 0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, -1, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0],
+        [0, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1],
+        [0, -1, 0, 0, -1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 0],
+        [0, 0, -1, 0, 0, 0, 0, 1, -1, 0, 0, 0, 0, 1, 0, 0],
+        [0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+    ],
+    dtype=torch.float32,
+)
+# q @ _LEFT is the matrix, row by row, that multiplies like the quaternion q from the left.
+_LEFT = torch.tensor(
+    [
+        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+        [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0],
+        [0, 0, -1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, -1, 0, 0],
+        [0, 0, 0, -1, 0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0],
+    ],
+    dtype=torch.float32,
+)
+# Under the root of a squared angle, which has no gradient at zero; far below what any angle is known to.
+_TINY = 1e-30
+
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] (radians) to matrices [..., 3, 3]."""
-    return axis_angle_to_rotation_matrix(axis_angle.reshape(-1, 3)).reshape(*axis_angle.shape[:-1], 3, 3)
+    """Rotation vectors [..., 3] (radians) to matrices [..., 3, 3], by Rodrigues' formula."""
+    cross = (axis_angle @ _CROSS.to(axis_angle)).unflatten(-1, (3, 3))
+    turns = (axis_angle.square().sum(-1)[..., None, None] + _TINY).sqrt() / math.pi
+    bend = 0.5 * torch.sinc(0.5 * turns).square()
+    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return identity + torch.sinc(turns) * cross + bend * (cross @ cross)
 
 
 def matrix_to_axis_angle(matrices: Tensor) -> Tensor:
@@ -31,10 +70,17 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_quat(matrices: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] to unit quaternions [..., 4] (w x y z)."""
-    return rotation_matrix_to_quaternion(matrices.reshape(-1, 3, 3).contiguous()).reshape(
-        *matrices.shape[:-2], 4
+    """Rotation matrices [..., 3, 3] to unit quaternions [..., 4] (w x y z), of which the largest part is > 0.
+
+    Every row of q q^T is q times one of its parts; the row of the largest part is the one to take.
+    """
+    flat = matrices.reshape(-1, 9)
+    outer = (flat @ _OUTER.to(flat)).unflatten(-1, (4, 4)) + torch.eye(
+        4, dtype=flat.dtype, device=flat.device
     )
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    rows = outer[torch.arange(len(flat), device=flat.device), largest]
+    return torch.nn.functional.normalize(rows, dim=-1).reshape(*matrices.shape[:-2], 4)
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -50,6 +96,11 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         dim=-1,
     )
+
+
+def left_products(quats: Tensor) -> Tensor:
+    """Matrices [..., 4, 4] that multiply like the quaternions [..., 4] from the left."""
+    return (quats @ _LEFT.to(quats)).unflatten(-1, (4, 4))
 
 
 def rot6d_to_matrix(rot6d: Tensor) -> Tensor:

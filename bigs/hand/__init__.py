@@ -3,7 +3,7 @@
 from bigs.hand.io import load_hand_model, load_hand_models
 from bigs.hand.lbs import blend_transforms, skin_points
 from bigs.hand.mirror import mirror_axis_angle, mirror_points, mirror_rotation, shared_betas
-from bigs.hand.model import JOINT_NAMES, MANO_PARENTS, HandModel, HandOutput
+from bigs.hand.model import JOINT_NAMES, MANO_PARENTS, HandModel, HandOutput, Skeleton
 from bigs.hand.procedural import procedural_hand
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "MANO_PARENTS",
     "HandModel",
     "HandOutput",
+    "Skeleton",
     "blend_transforms",
     "load_hand_model",
     "load_hand_models",

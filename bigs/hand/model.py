@@ -30,6 +30,14 @@ class HandOutput(NamedTuple):
     bone_transforms: Tensor  # [T, 16, 4, 4] shaped rest pose to posed
 
 
+class Skeleton(NamedTuple):
+    """A hand's shape and its bones in each of T frames."""
+
+    shaped: Tensor  # [V, 3] rest vertices, before any pose corrective
+    joints: Tensor  # [T, 16, 3] in the frame that the wrist was given in
+    bone_transforms: Tensor  # [T, 16, 4, 4] shaped rest pose to posed
+
+
 class HandModel(nn.Module):
     """One hand: rest shape, joint tree and skinning.
 
@@ -115,12 +123,26 @@ class HandModel(nn.Module):
         Returns:
             Vertices, 21 joints and bone transforms in the frame of `wrist`.
         """
+        skeleton = self.skeleton(betas, hand_pose, global_orient, wrist)
+        vertices = self.skin(skeleton, hand_pose)
+        joints = torch.cat([skeleton.joints, vertices[:, self.tip_vertex_ids]], dim=1)
+        return HandOutput(vertices, joints, skeleton.bone_transforms)
+
+    def skeleton(self, betas: Tensor, hand_pose: Tensor, global_orient: Tensor, wrist: Tensor) -> Skeleton:
+        """The bones alone; arguments as in `forward`."""
         shaped = self.rest_vertices(betas)
         rotations = torch.cat([global_orient[:, None], hand_pose], dim=1)
-        joints, bones = forward_kinematics(rotations, self.J_regressor @ shaped, self.parents, wrist)
-        rest = shaped + self.corrective(hand_pose) if self.has_posedirs else shaped
-        vertices = skin_points(rest, self.lbs_weights, bones)
-        return HandOutput(vertices, torch.cat([joints, vertices[:, self.tip_vertex_ids]], dim=1), bones)
+        return Skeleton(
+            shaped, *forward_kinematics(rotations, self.J_regressor @ shaped, self.parents, wrist)
+        )
+
+    def skin(self, skeleton: Skeleton, hand_pose: Tensor, vertices: Tensor | None = None) -> Tensor:
+        """Vertices [T, V, 3] of a posed skeleton, or of some `vertices` (indices) only."""
+        some = slice(None) if vertices is None else vertices
+        rest = skeleton.shaped[..., some, :]
+        if self.has_posedirs:
+            rest = rest + pose_corrective(self.posedirs[some], hand_pose)
+        return skin_points(rest, self.lbs_weights[some], skeleton.bone_transforms)
 
     def pose_matrices(self, hand_pose_aa: Tensor) -> Tensor:
         """Finger rotations [..., 15, 3, 3] of mean-relative axis-angle [..., 15, 3] (flat_hand_mean=False).

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder, SkinningDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
-from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.geometry.rotations import left_products, matrix_to_quat, quat_multiply
 from bigs.hand import HandModel, mirror_points, skin_points
 from bigs.hand.lbs import pose_corrective
 from bigs.models.poses import HandFrames
@@ -170,10 +170,17 @@ def pose_hand(
         frames: poses of the canonical (right) hand: for a left hand, of its mirror image.
         side: which hand to show.
     """
-    bones = model(betas, frames.hand_pose, frames.global_orient, frames.wrist).bone_transforms
+    skeleton = model.skeleton(betas, frames.hand_pose, frames.global_orient, frames.wrist)
+    return pose_splats(hand, betas, frames.hand_pose, skeleton.bone_transforms, side)
+
+
+def pose_splats(
+    hand: CanonicalHand, betas: Tensor, hand_pose: Tensor, bones: Tensor, side: Side
+) -> Gaussians:
+    """The same along bones [B, 16, 4, 4] that are known; hand_pose [B, 15, 3, 3] is for the correctives."""
     points = hand.points + hand.shapedirs @ betas
     if hand.posedirs is not None:
-        points = points + pose_corrective(hand.posedirs, frames.hand_pose)
+        points = points + pose_corrective(hand.posedirs, hand_pose)
     return skin_hand(hand, points, bones, side)
 
 
@@ -183,7 +190,7 @@ def skin_hand(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) ->
     if hand.quats is None:
         quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(hand.scales), 4)
     else:
-        quats = quat_multiply(blend_quats(hand.weights, bones), hand.quats)
+        quats = turn_quats(hand.quats, hand.weights, bones)
     if side == "left":
         means = mirror_points(means)
         # S R S for S = diag(-1, 1, 1): the same turn as seen in the mirror.
@@ -191,15 +198,17 @@ def skin_hand(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) ->
     return Gaussians(means, quats, hand.scales, hand.opacities, hand.colors)
 
 
-def blend_quats(weights: Tensor, bone_transforms: Tensor) -> Tensor:
-    """Orientation [B, N, 4] of skinned points: the weighted sum of the bones' quaternions, signs aligned.
+def turn_quats(quats: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Orientation [B, N, 4] of skinned Gaussians: quats [N, 4] turned by the bones' blended quaternions.
 
-    Cheaper than a matrix-to-quaternion conversion a Gaussian and frame, and equal to it where one bone rules.
-    The result need not be unit.
+    The blend is the sum weighted by [N, 16], signs aligned: cheaper than a matrix-to-quaternion conversion a
+    Gaussian and frame, and equal to it where one bone rules. The result need not be unit. As in
+    `skin_points`, one matrix product over (bone, part of the quaternion) pairs does it all.
     """
-    quats = matrix_to_quat(bone_transforms[..., :3, :3])
-    aligned = torch.where((quats * quats[:, :1]).sum(-1, keepdim=True) < 0, -quats, quats)
-    return weights @ aligned
+    bones = matrix_to_quat(bone_transforms[..., :3, :3])
+    aligned = torch.where((bones * bones[:, :1]).sum(-1, keepdim=True) < 0, -bones, bones)
+    features = (weights[:, :, None] * quats[:, None, :]).flatten(1)
+    return features @ left_products(aligned).transpose(-1, -2).flatten(1, 2)
 
 
 def neighbour_weights(points: np.ndarray, verts: Tensor, lbs_weights: Tensor, neighbours: int = 6) -> Tensor:

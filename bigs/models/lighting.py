@@ -36,12 +36,25 @@ class Lighting(nn.Module):
             {entity: nn.Parameter(torch.zeros(n_frames, 4 + N_PARTS)) for entity in entities}
         )
 
-    def forward(self, entity: Entity, gaussians: Gaussians, frames: Tensor, weights: Tensor) -> Gaussians:
+    def forward(
+        self,
+        entity: Entity,
+        gaussians: Gaussians,
+        frames: Tensor,
+        weights: Tensor,
+        normals: Tensor | None = None,
+    ) -> Gaussians:
         """Lit Gaussians of one entity at `frames` [B]; see `light`."""
-        return light(gaussians, self.clip, self.shade[entity][frames], weights)
+        return light(gaussians, self.clip, self.shade[entity][frames], weights, normals)
 
 
-def light(gaussians: Gaussians, clip: Tensor, shade: Tensor, weights: Tensor | None = None) -> Gaussians:
+def light(
+    gaussians: Gaussians,
+    clip: Tensor,
+    shade: Tensor,
+    weights: Tensor | None = None,
+    normals: Tensor | None = None,
+) -> Gaussians:
     """Multiply albedos [N, 3] by the light on each Gaussian's third axis, its outward normal in camera space.
 
     Args:
@@ -49,11 +62,12 @@ def light(gaussians: Gaussians, clip: Tensor, shade: Tensor, weights: Tensor | N
         clip: [8, 3] coefficients of `quadratic_basis` for the whole clip.
         shade: [B, 4 + J] a constant, a slope, and a constant for each of J parts, for each frame.
         weights: [N, J] how far a Gaussian belongs to each part; None where there are none.
+        normals: [B, N, 3] those third axes, where they are known already.
 
     Returns:
         The Gaussians with colours [B, N, 3].
     """
-    normals = third_axis(gaussians.quats)
+    normals = third_axis(gaussians.quats) if normals is None else normals
     shaded = shade[:, None, :1] + normals @ shade[:, 1:4, None]
     if weights is not None:
         shaded = shaded + weights @ shade[:, 4:, None]

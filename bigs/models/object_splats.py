@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.mesh import frames_from_normals, point_spacing
-from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.geometry.rotations import left_products, matrix_to_quat, quat_multiply
 from bigs.models.lighting import N_PARTS
 from bigs.models.poses import ObjectFrames
 from bigs.types import Gaussians
@@ -119,5 +119,5 @@ def region_weights(points: np.ndarray, normals: np.ndarray, count: int) -> np.nd
 def pose_object(obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:
     """Carry the canonical Gaussians to B frames, in camera space."""
     means = frames.scale * obj.means @ frames.rotations.transpose(-1, -2) + frames.centers[:, None]
-    quats = quat_multiply(matrix_to_quat(frames.rotations)[:, None], obj.quats)
+    quats = obj.quats @ left_products(matrix_to_quat(frames.rotations)).transpose(-1, -2)
     return Gaussians(means, quats, frames.scale * obj.scales, obj.opacities, obj.colors)

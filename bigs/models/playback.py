@@ -174,8 +174,8 @@ def record(
     shade = {entity: value.detach().clone() for entity, value in lighting.shade.items()}
     for side in scene.sides:
         model, betas = scene.hand_model(side), scene.hand_betas(side)
-        pose = scene.hand_frames(side, frames)
-        verts, joints = scene.hand_points(side, frames)
+        pose = scene.at(frames).canonical_hand(side)
+        verts, joints = scene.at(frames).verts(side), scene.at(frames).joints(side)
         splats = canonical[side]
         orient, fingers = matrix_to_axis_angle(pose.global_orient), model.pose_axis_angle(pose.hand_pose)
         transl = pose.wrist - model.rest_joints(betas)[0]
@@ -206,7 +206,7 @@ def record(
         )
     obj = None
     if scene.object_splats is not None:
-        placed = scene.object_frames(frames)
+        placed = scene.at(frames).object
         surface = scene.object_surface
         obj = ObjectPlayback(
             placed.rotations,

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from bigs.geometry.distance import DistanceField
-from bigs.hand import HandModel, mirror_points
+from bigs.hand import HandModel
 from bigs.models.grasps import Grasps
-from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_hand
+from bigs.models.hand_splats import CanonicalHand, HandSplats
 from bigs.models.lighting import Lighting
-from bigs.models.object_splats import CanonicalObject, ObjectSplats, pose_object
-from bigs.models.poses import HandFrames, HandPoses, ObjectFrames, ObjectPoses
+from bigs.models.moments import Moments
+from bigs.models.object_splats import CanonicalObject, ObjectSplats
+from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
 
 
@@ -125,60 +126,13 @@ class Scene(nn.Module):
             result[entity] = evaluated[owner]
         return result
 
-    def hand_frames(self, side: Side, frames: Tensor) -> HandFrames:
-        """Poses of the canonical hand at `frames` [B]; a left hand's wrist is seen in the mirror."""
-        pose = self.hand_pose(side, frames)
-        return pose._replace(wrist=mirror_points(pose.wrist)) if side == "left" else pose
-
-    def hand_pose(self, side: Side, frames: Tensor) -> HandFrames:
-        """The same with the wrist where it is; in a grasp the object carries the hand."""
-        poses, grasps = self.hand_poses[side], self.grasps[side]
-        held = grasps.held(frames)
-        if not held.any():
-            return poses(frames)
-        carried, own = grasps(frames, self.object_frames(frames)), poses.start(frames)
-        start = (
-            torch.where(held.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-            for a, b in zip(carried, own, strict=True)
-        )
-        return poses(frames, HandFrames(*start), torch.where(held, grasps.slack, 1.0))
+    def at(self, frames: Tensor) -> Moments:
+        """Hands and object at `frames` [B]."""
+        return Moments(self, frames)
 
     def free_frames(self, side: Side) -> Tensor:
         """The frames in which a hand belongs to no grasp, rising."""
         return torch.nonzero(self.grasps[side].of_frame < 0).flatten()
-
-    def object_frames(self, frames: Tensor) -> ObjectFrames:
-        return self.object_poses(frames)
-
-    def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject, frames: Tensor) -> Gaussians:
-        """Gaussians of one entity at `frames` [B], camera space and lit: means [B, N, 3], quats [B, N, 4]."""
-        if entity == "object":
-            posed = pose_object(canonical, self.object_frames(frames))
-        else:
-            pose = self.hand_frames(entity, frames)
-            posed = pose_hand(self.hand_model(entity), canonical, self.hand_betas(entity), pose, entity)
-        if self.lighting is None:
-            return posed
-        # Light has no say in how a hand bends.
-        return self.lighting(entity, posed, frames, canonical.weights.detach())
-
-    def hand_points(self, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices [B, V, 3] and 21 joints [B, 21, 3] of a hand in camera space, metres."""
-        pose = self.hand_frames(side, frames)
-        out = self.hand_model(side)(self.hand_betas(side), pose.hand_pose, pose.global_orient, pose.wrist)
-        if side == "left":
-            return mirror_points(out.vertices), mirror_points(out.joints)
-        return out.vertices, out.joints
-
-    def object_points(self, points: Tensor, frames: Tensor) -> Tensor:
-        """Points [N, 3] of the object's own frame in camera space at `frames`: [B, N, 3]."""
-        pose = self.object_frames(frames)
-        return pose.scale * points @ pose.rotations.transpose(-1, -2) + pose.centers[:, None]
-
-    def in_object_frame(self, points: Tensor, frames: Tensor) -> Tensor:
-        """Camera points [B, N, 3] in the object's own frame (metres at the initial size)."""
-        pose = self.object_frames(frames)
-        return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
 
 def concatenate(parts: Iterable[Gaussians]) -> Gaussians:

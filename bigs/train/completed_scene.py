@@ -104,7 +104,7 @@ def _at_final_poses(scene: Scene, clip: Clip, evidence: Evidence, initial: Initi
     if not shown.any():
         shown[:] = True
     start = object_in_camera(clip, initial)
-    pose = scene.object_frames(torch.arange(scene.n_frames))
+    pose = scene.at(torch.arange(scene.n_frames)).object
     nearest = scipy.spatial.cKDTree(canonical.means.numpy()[shown]).query(start.points)[1]
     colors = canonical.colors.numpy()[shown][nearest]
     return start._replace(rotations=pose.rotations, centers=pose.centers / pose.scale, colors=colors)

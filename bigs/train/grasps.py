@@ -61,13 +61,13 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
     frames = torch.arange(scene.n_frames)
     found = {}
     for side in scene.sides:
-        joints = scene.in_object_frame(scene.hand_points(side, frames)[1], frames)
+        joints = scene.at(frames).in_object_frame(scene.at(frames).joints(side))
         found[side] = still_frames(scene.object_poses.log_scale.exp() * joints, touching[side], stage)
         of_frame = torch.full((scene.n_frames,), -1)
         for g, stretch in enumerate(found[side]):
             of_frame[stretch.start : stretch.stop] = g
-        poses, own = scene.hand_pose(side, frames), scene.hand_poses[side]
-        scene.grasps[side].set(of_frame, stage.slack, poses, scene.object_frames(frames))
+        poses, own = scene.at(frames).hand(side), scene.hand_poses[side]
+        scene.grasps[side].set(of_frame, stage.slack, poses, scene.at(frames).object)
         held = scene.grasps[side].held(frames)
         if held.any():
             correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
@@ -76,8 +76,8 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
                 hand_pose=torch.where(held[:, None, None, None], poses.hand_pose, corrected)
             )
         own.restart(poses)
-        orient = scene.hand_pose(side, frames).global_orient
-        seen = scene.object_frames(frames).rotations
+        orient = scene.at(frames).hand(side).global_orient
+        seen = scene.at(frames).object.rotations
         turned = turned_between(
             orient, mirror_rotation(seen) if side == "left" else seen, found[side], stage.longest_move
         )

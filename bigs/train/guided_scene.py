@@ -30,7 +30,7 @@ def scene_coverage(scene: Scene, evidence: Evidence) -> tuple[Coverage, Orbit]:
     canonical = scene.object_splats()
     frames = frames_seen(canonical, object_views(scene, evidence))
     seen = torch.as_tensor(frames >= min(_LEAST_FRAMES, scene.n_frames))
-    pose = scene.object_frames(torch.arange(scene.n_frames))
+    pose = scene.at(torch.arange(scene.n_frames)).object
     up = -pose.rotations[:, 1].mean(0)
     towards = -(pose.rotations.transpose(-1, -2) @ pose.centers[..., None])[..., 0]
     front = torch.nn.functional.normalize(towards, dim=-1).mean(0)

@@ -16,6 +16,7 @@ from unittest import mock
 
 import torch
 
+from bigs.models.moments import Moments
 from bigs.models.scene import Scene
 from bigs.raster import rust
 from bigs.train import step, terms
@@ -135,10 +136,7 @@ def profiled() -> Iterator[Profile]:
     """A profile of what runs inside; its `listen` must hear the run's events."""
     profile = Profile()
     functions: list[tuple[Any, str, str]] = [
-        (Scene, "posed", _POSING),
-        (Scene, "hand_points", _POSING),
-        (Scene, "hand_frames", _POSING),
-        (terms, "pose_hand", _POSING),
+        *((Moments, name, _POSING) for name in ("posed", "posed_hand", "verts", "joints", "object_points")),
         (step, "rasterization", _ENGINE),
         (rust._raster, "rasterize_backward", _ENGINE_BACK),
         (torch.Tensor, "backward", _BACK),

@@ -32,13 +32,13 @@ def search_object_scale(
     factors = torch.linspace(1.0 - stage.span, 1.0 + stage.span, stage.candidates)
     start = scene.object_poses.log_scale.clone()
     frames = torch.arange(scene.n_frames)
-    hands = {side: scene.hand_points(side, frames)[0] for side in scene.sides}
+    hands = {side: scene.at(frames).verts(side) for side in scene.sides}
     costs = torch.zeros(len(factors))
     for c, factor in enumerate(factors):
         scene.object_poses.log_scale.copy_(start + factor.log())
         scale = scene.object_poses.log_scale.exp()
         for side, verts in hands.items():
-            distances = scale * scene.object_distance(scene.in_object_frame(verts, frames))
+            distances = scale * scene.object_distance(scene.at(frames).in_object_frame(verts))
             costs[c] += surface_contact(distances, touching[side]) / len(hands)
         costs[c] += stage.labels_weight * occlusion()
     if not any(bool(t.any()) for t in touching.values()):

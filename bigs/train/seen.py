@@ -23,7 +23,7 @@ _GUARD_FRAMES = 12
 
 def object_views(scene: Scene, evidence: Evidence) -> ObjectViews:
     """Where the object shows in each frame, in its own units: the camera's distance changes with its size."""
-    pose = scene.object_frames(torch.arange(scene.n_frames))
+    pose = scene.at(torch.arange(scene.n_frames)).object
     shown = evidence.targets.shares["object"] > 0.5
     centers = pose.centers / pose.scale
     return ObjectViews(
@@ -57,7 +57,7 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
         parts = []
         for entity in scene.entities:
             with torch.no_grad():
-                part = scene.posed(entity, canonical[entity], frame)
+                part = scene.at(frame).posed(entity, canonical[entity])
             colors = ink[None] if entity == "object" else torch.zeros(1, len(part.opacities), 1)
             parts.append(part._replace(colors=colors))
         (weights,) = torch.autograd.grad(step.render(concatenate(parts)).colors.sum(), ink)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_splats import CanonicalHand
+from bigs.models.moments import Moments
 from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene, concatenate
 from bigs.raster import rasterization
@@ -60,9 +61,9 @@ class Step:
         return tuple(e for e in self.entities if e != "object")
 
     @cached_property
-    def everything(self) -> Tensor:
-        """All frames of the clip, for terms over time."""
-        return torch.arange(self.scene.n_frames)
+    def clip(self) -> Moments:
+        """All frames, for terms over time."""
+        return self.scene.at(torch.arange(self.scene.n_frames))
 
     def frames_of(self, entity: Entity) -> Tensor:
         """The frames in which a subject is looked at alone."""
@@ -107,7 +108,7 @@ class Step:
         """One subject rendered without the others (the paper's single-subject step)."""
         if entity not in self._alone:
             frames = self.frames_of(entity)
-            self._alone[entity] = self.render(self.scene.posed(entity, self.canonical[entity], frames))
+            self._alone[entity] = self.render(self.clip.at(frames).posed(entity, self.canonical[entity]))
         return self._alone[entity]
 
     @cached_property
@@ -116,7 +117,7 @@ class Step:
         labels = torch.eye(len(self.entities))
         parts = []
         for entity, label in zip(self.entities, labels, strict=True):
-            part = self.scene.posed(entity, self.canonical[entity], self.frames)
+            part = self.clip.at(self.frames).posed(entity, self.canonical[entity])
             if self.with_labels:
                 channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
                 part = part._replace(colors=channels)
@@ -139,17 +140,17 @@ class Step:
         )
 
     @cached_property
-    def hands(self) -> dict[Side, tuple[Tensor, Tensor]]:
-        """Vertices and joints of every hand in every frame of the clip."""
-        return {side: self.scene.hand_points(side, self.everything) for side in self.scene.sides}
+    def joints(self) -> dict[Side, Tensor]:
+        """Joints [T, 21, 3] of every hand in every frame of the clip."""
+        return {side: self.clip.joints(side) for side in self.scene.sides}
 
     @cached_property
     def object_distances(self) -> dict[Side, Tensor]:
         """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
         scale = self.scene.object_poses.log_scale.exp()
         return {
-            side: scale * self.scene.object_distance(self.scene.in_object_frame(verts, self.everything))
-            for side, (verts, _) in self.hands.items()
+            side: scale * self.scene.object_distance(self.clip.in_object_frame(self.clip.verts(side)))
+            for side in self.scene.sides
         }
 
     @property

@@ -13,7 +13,6 @@ from bigs.losses.perceptual import masked_perceptual
 from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
-from bigs.models.hand_splats import pose_hand
 from bigs.train.step import Step
 from bigs.types import Entity, Side
 
@@ -123,14 +122,8 @@ def silhouette(step: Step) -> Tensor:
     """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
 
     def one(side: Side) -> Tensor:
-        scene, evidence, frames = step.scene, step.evidence, step.frames_of(side)
-        posed = pose_hand(
-            scene.hand_model(side),
-            evidence.silhouettes[side],
-            scene.hand_betas(side),
-            scene.hand_frames(side, frames),
-            side,
-        )
+        evidence, frames = step.evidence, step.frames_of(side)
+        posed = step.clip.at(frames).posed_hand(side, evidence.silhouettes[side])
         hidden = evidence.targets.hidden(side, frames)
         return amodal_silhouette(step.render(posed).alphas[..., 0], step.seen_alone(side)[1], hidden)
 
@@ -168,14 +161,14 @@ def smooth(step: Step) -> Tensor:
     """The paper's L_smt over the whole clip."""
 
     def one(side: Side) -> Tensor:
-        pose = step.scene.hand_frames(side, step.everything)
+        pose = step.clip.canonical_hand(side)
         return pose_steps(torch.cat([pose.global_orient[:, None], pose.hand_pose], dim=1), pose.wrist)
 
     return _mean(one(side) for side in step.scene.sides)
 
 
 def joint_acceleration(step: Step) -> Tensor:
-    return _mean(acceleration(joints) for _, joints in step.hands.values())
+    return _mean(acceleration(joints) for joints in step.joints.values())
 
 
 def object_acceleration(step: Step) -> Tensor:
@@ -183,7 +176,7 @@ def object_acceleration(step: Step) -> Tensor:
         return torch.zeros(())
     reach = step.scene.object_surface.verts.abs().amax()
     corners = reach * torch.eye(3)
-    return acceleration(step.scene.object_points(corners, step.everything))
+    return acceleration(step.clip.object_points(corners))
 
 
 def orient_prior(step: Step) -> Tensor:
@@ -222,7 +215,7 @@ def rigid(step: Step) -> Tensor:
 
     def one(side: Side) -> Tensor:
         touching = step.evidence.touching[side]
-        joints = step.scene.in_object_frame(step.hands[side][1], step.everything)
+        joints = step.clip.in_object_frame(step.joints[side])
         return velocity(joints, touching[1:] * touching[:-1])
 
     return _mean(one(side) for side in step.scene.sides)
@@ -233,10 +226,10 @@ def contact(step: Step) -> Tensor:
     if not step.has_object:
         return torch.zeros(())
     if step.evidence.contact == "center":
-        centers = step.scene.object_frames(step.everything).centers
+        centers = step.clip.object.centers
         return _mean(
             center_contact(centers, joints[:, 0], step.evidence.touching[side])
-            for side, (_, joints) in step.hands.items()
+            for side, joints in step.joints.items()
         )
     return _mean(
         surface_contact(distances, step.evidence.touching[side])

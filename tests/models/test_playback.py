@@ -40,7 +40,7 @@ def test_a_recording_shows_what_the_scene_shows(pair) -> None:
     scene, playback = pair
     frames = torch.tensor([2, 0])
     canonical = scene.canonical(scene.entities)
-    expected = {entity: scene.posed(entity, canonical[entity], frames) for entity in scene.entities}
+    expected = {entity: scene.at(frames).posed(entity, canonical[entity]) for entity in scene.entities}
     assert playback.entities == scene.entities and len(playback) == FRAMES
     for entity in scene.entities:
         for name, value in playback.gaussians([2, 0], [entity])._asdict().items():
@@ -59,7 +59,7 @@ def test_the_trajectory_is_the_scenes_meshes(pair) -> None:
     assert tuple(trajectory.verts) == tuple(trajectory.joints) == tuple(trajectory.faces) == scene.sides
     frames = torch.arange(FRAMES)
     for side in scene.sides:
-        verts, joints = scene.hand_points(side, frames)
+        verts, joints = scene.at(frames).verts(side), scene.at(frames).joints(side)
         np.testing.assert_array_equal(trajectory.verts[side], verts.numpy())
         np.testing.assert_array_equal(trajectory.joints[side], joints.numpy())
         corners = trajectory.verts[side][0][trajectory.faces[side]]
@@ -69,7 +69,7 @@ def test_the_trajectory_is_the_scenes_meshes(pair) -> None:
         assert trajectory.object_verts is None and trajectory.object_faces is None
     else:
         np.testing.assert_allclose(
-            trajectory.object_verts, scene.object_points(scene.object_surface.verts, frames), atol=1e-6
+            trajectory.object_verts, scene.at(frames).object_points(scene.object_surface.verts), atol=1e-6
         )
         np.testing.assert_array_equal(trajectory.object_faces, scene.object_surface.faces)
 

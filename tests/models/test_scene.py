@@ -67,13 +67,13 @@ def test_any_subjects_make_a_scene(sides, with_object) -> None:
     assert scene.n_frames == FRAMES
     canonical = scene.canonical(scene.entities)
     for entity in scene.entities:
-        assert scene.posed(entity, canonical[entity], ALL[:2]).means.shape[0] == 2
+        assert scene.at(ALL[:2]).posed(entity, canonical[entity]).means.shape[0] == 2
 
 
 @torch.no_grad()
 def test_the_left_wrist_is_where_its_pose_says_in_the_camera(scene: Scene) -> None:
     for side in scene.sides:
-        _, joints = scene.hand_points(side, ALL)
+        joints = scene.at(ALL).joints(side)
         torch.testing.assert_close(joints[:, 0], scene.hand_poses[side](ALL).wrist, atol=1e-6, rtol=0)
 
 
@@ -88,7 +88,7 @@ def test_a_left_hand_is_the_left_model_in_its_own_pose(scene: Scene) -> None:
         mirror_rotation(pose.global_orient),
         pose.wrist,
     )
-    verts, joints = scene.hand_points("left", ALL)
+    verts, joints = scene.at(ALL).verts("left"), scene.at(ALL).joints("left")
     torch.testing.assert_close(verts, out.vertices, atol=1e-6, rtol=0)
     torch.testing.assert_close(joints, out.joints, atol=1e-6, rtol=0)
 
@@ -97,8 +97,8 @@ def test_a_left_hand_is_the_left_model_in_its_own_pose(scene: Scene) -> None:
 def test_gaussians_lie_on_the_mesh_of_their_hand(scene: Scene) -> None:
     canonical = scene.canonical(scene.entities)
     for side in scene.sides:
-        means = scene.posed(side, canonical[side], ALL).means
-        verts, _ = scene.hand_points(side, ALL)
+        means = scene.at(ALL).posed(side, canonical[side]).means
+        verts = scene.at(ALL).verts(side)
         # Offsets and insets are millimetres; the disturbed skinning adds some at the finger tips.
         assert (means - verts).norm(dim=-1).median() < 0.01
         wrong = mirror_points(verts)
@@ -108,17 +108,17 @@ def test_gaussians_lie_on_the_mesh_of_their_hand(scene: Scene) -> None:
 @torch.no_grad()
 def test_object_points_and_the_objects_frame_are_inverse(scene: Scene) -> None:
     surface = scene.object_surface.verts
-    world = scene.object_points(surface, ALL)
-    pose = scene.object_frames(ALL)
+    world = scene.at(ALL).object_points(surface)
+    pose = scene.at(ALL).object
     assert world.shape == (FRAMES, len(surface), 3)
     reach = (world - pose.centers[:, None]).norm(dim=-1)
     torch.testing.assert_close(reach, (pose.scale * OBJECT_RADIUS).expand_as(reach), atol=1e-6, rtol=0)
-    back = scene.in_object_frame(world, ALL)
+    back = scene.at(ALL).in_object_frame(world)
     torch.testing.assert_close(back, surface.expand_as(back), atol=1e-6, rtol=0)
     assert scene.object_distance(back).abs().max() < 2e-3
     torch.testing.assert_close(
-        scene.posed("object", scene.canonical(["object"])["object"], ALL).means,
-        scene.object_points(scene.object_splats().means, ALL),
+        scene.at(ALL).posed("object", scene.canonical(["object"])["object"]).means,
+        scene.at(ALL).object_points(scene.object_splats().means),
     )
 
 
@@ -133,7 +133,7 @@ def test_the_objects_scale_cannot_be_seen() -> None:
     outlines, depths, sizes = [], [], []
     for log_scale in (0.0, 0.4, -0.7):
         scene.object_poses.log_scale.fill_(log_scale)
-        posed = scene.posed("object", scene.canonical(["object"])["object"], ALL)
+        posed = scene.at(ALL).posed("object", scene.canonical(["object"])["object"])
         axes = quat_to_matrix(posed.quats) * posed.scales[..., None, :]
         ends = torch.cat([posed.means[..., None], posed.means[..., None] + axes], dim=-1).mT
         outlines.append(pixels(scene, ends))
@@ -149,10 +149,10 @@ def test_the_objects_scale_cannot_be_seen() -> None:
 def test_lighting_changes_colours_alone() -> None:
     scene = make_scene()
     canonical = scene.canonical(scene.entities)
-    lit = {entity: scene.posed(entity, canonical[entity], ALL) for entity in scene.entities}
+    lit = {entity: scene.at(ALL).posed(entity, canonical[entity]) for entity in scene.entities}
     lighting, scene.lighting = scene.lighting, None
     for entity, with_light in lit.items():
-        plain = scene.posed(entity, canonical[entity], ALL)
+        plain = scene.at(ALL).posed(entity, canonical[entity])
         assert torch.equal(with_light.means, plain.means) and torch.equal(with_light.quats, plain.quats)
         again = lighting(entity, plain, ALL, canonical[entity].weights)
         torch.testing.assert_close(with_light.colors, again.colors)
@@ -194,10 +194,10 @@ def test_concatenation_of_lit_gaussians_joins_along_gaussians() -> None:
 def test_state_dict_restores_a_scene() -> None:
     one, other = make_scene(seed=0), make_scene(seed=5)
     frames = torch.tensor([2, 0])
-    assert not torch.equal(one.hand_points("left", frames)[0], other.hand_points("left", frames)[0])
+    assert not torch.equal(one.at(frames).verts("left"), other.at(frames).verts("left"))
     other.load_state_dict(one.state_dict(), strict=True)
     for entity in one.entities:
-        a, b = (s.posed(entity, s.canonical([entity])[entity], frames) for s in (one, other))
+        a, b = (s.at(frames).posed(entity, s.canonical([entity])[entity]) for s in (one, other))
         for x, y in zip(a, b, strict=True):
             assert torch.equal(x, y)
 
@@ -215,7 +215,7 @@ def test_posing_a_hand_through_the_scene_is_pose_hand(scene: Scene) -> None:
     pose = scene.hand_poses["right"](ALL)
     canonical = scene.canonical(["right"])["right"]
     direct = pose_hand(hand_model(rich=True), canonical, scene.betas["right"], pose, "right")
-    assert torch.equal(scene.posed("right", canonical, ALL).means, direct.means)
+    assert torch.equal(scene.at(ALL).posed("right", canonical).means, direct.means)
     turned = rotations(FRAMES, seed=99)
     other = pose_hand(
         hand_model(rich=True), canonical, scene.betas["right"], pose._replace(global_orient=turned), "right"

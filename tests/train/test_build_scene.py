@@ -49,7 +49,7 @@ def test_hands_start_at_the_estimates(scene: Scene, tiny: Clip, both_hands: dict
     given = initial_trajectory(tiny, both_hands)
     frames = torch.arange(len(tiny))
     for side in SIDES:
-        _, joints = scene.hand_points(side, frames)
+        joints = scene.at(frames).joints(side)
         np.testing.assert_allclose(joints[:, 0].numpy(), given.joints[side][:, 0], atol=1e-5)
         assert np.linalg.norm(joints.numpy() - given.joints[side], axis=-1).max() < 0.01
     betas = np.mean([tiny.hands[side].betas for side in SIDES], axis=0)
@@ -82,7 +82,7 @@ def test_one_hand_keeps_its_own_shape(tiny: Clip, both_hands: dict[Side, HandMod
     for side in SIDES:
         one, _ = build(replace(tiny, hands={side: tiny.hands[side]}), both_hands, shape_error=0.0)
         assert one.entities == (side, "object")
-        _, joints = one.hand_points(side, torch.arange(len(tiny)))
+        joints = one.at(torch.arange(len(tiny))).joints(side)
         np.testing.assert_allclose(
             joints.numpy(), initial_trajectory(tiny, both_hands).joints[side], atol=5e-4
         )
@@ -94,7 +94,7 @@ def test_the_object_starts_at_the_estimates(
 ) -> None:
     given = initial_trajectory(tiny, both_hands).object_verts
     assert given is not None
-    surface = scene.object_points(scene.object_surface.verts, torch.arange(len(tiny))).numpy()
+    surface = scene.at(torch.arange(len(tiny))).object_points(scene.object_surface.verts).numpy()
     for t in (0, 6):
         distance, _ = cKDTree(surface[t]).query(given[t])
         # A stray point is anywhere; most lie on the surface.
@@ -108,7 +108,7 @@ def test_start_values_render_where_the_masks_are(scene: Scene, tiny: Clip) -> No
     for t in range(0, len(tiny), 4):
         labels = tiny.mask(t)
         for entity in scene.entities:
-            posed = scene.posed(entity, canonical[entity], torch.tensor([t]))
+            posed = scene.at(torch.tensor([t])).posed(entity, canonical[entity])
             out = rasterization(*posed, torch.eye(4)[None], scene.K[None], scene.width, scene.height)
             alpha = out.alphas[0, 0, ..., 0].numpy() > 0.5
             own, others = labels == MASK_VALUES[entity], (labels != 0) & (labels != MASK_VALUES[entity])

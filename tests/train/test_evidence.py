@@ -65,7 +65,7 @@ def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
     stage = replace(FAST.stages[0], image_size=size)
     evidence = source.evidence(stage)
     targets, side, frames = evidence.targets, "right", torch.tensor([0, 6])
-    verts = scene.hand_points(side, frames)[0].detach().numpy()
+    verts = scene.at(frames).verts(side).detach().numpy()
     faces = scene.hand_model(side).faces.numpy()
     step = Step(scene, evidence, (side,), {}, frames)
     shares = [
@@ -81,7 +81,7 @@ def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
                 scene.hand_model(side),
                 evidence.silhouettes[side],
                 scene.hand_betas(side),
-                scene.hand_frames(side, frames),
+                scene.at(frames).canonical_hand(side),
                 side,
             )
             alphas = step.render(posed).alphas[..., 0]

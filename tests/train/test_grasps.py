@@ -77,7 +77,7 @@ def turning_scene(wander: float = 0.0) -> Scene:
     noise = wander * torch.randn(FRAMES, 3, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         scene.object_poses.base_orient.copy_(rotations)
-        centers = scene.object_frames(torch.arange(FRAMES)).centers
+        centers = scene.at(torch.arange(FRAMES)).object.centers
         for side in scene.sides:
             poses = scene.hand_poses[side]
             away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
@@ -96,24 +96,24 @@ def test_the_object_carries_hands_that_hold_it() -> None:
     found = find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
     assert found == {"right": [range(0, FRAMES)], "left": [range(0, FRAMES)]}
     for side in scene.sides:
-        joints = scene.in_object_frame(scene.hand_points(side, ALL)[1], ALL)
+        joints = scene.at(ALL).in_object_frame(scene.at(ALL).joints(side))
         assert (joints - joints[:1]).abs().max() < 1e-5, "still in the object's frame"
-        error = scene.hand_points(side, ALL)[1] - truth.hand_points(side, ALL)[1]
+        error = scene.at(ALL).joints(side) - truth.at(ALL).joints(side)
         assert error.norm(dim=-1).max() < 0.0008, "a mean of 24 frames is nearer than any of them"
 
 
 def test_a_grasp_moves_as_one_and_a_frame_only_by_its_slack() -> None:
     scene = turning_scene()
     find_grasps(scene, GraspStage(slack=0.1), EVERYWHERE)
-    before = scene.hand_points("left", ALL)[1]
+    before = scene.at(ALL).joints("left")
     with torch.no_grad():
         scene.grasps["left"].position[0] += torch.tensor([0.01, 0.0, 0.0])
-    shift = scene.hand_points("left", ALL)[1] - before
+    shift = scene.at(ALL).joints("left") - before
     torch.testing.assert_close(shift.norm(dim=-1), torch.full((FRAMES, 21), 0.01), atol=1e-5, rtol=0)
     with torch.no_grad():
         scene.grasps["left"].position.zero_()
         scene.hand_poses["left"].position.log_depth[3] = math.log(1.1) / 0.1
-    wrists = scene.hand_points("left", ALL)[1][:, 0]
+    wrists = scene.at(ALL).joints("left")[:, 0]
     ratio = wrists[:, 2] / before[:, 0, 2]
     torch.testing.assert_close(ratio[3], torch.tensor(1.1), atol=1e-5, rtol=0)
     torch.testing.assert_close(ratio[4:], torch.ones(FRAMES - 4), atol=1e-5, rtol=0)
@@ -122,10 +122,10 @@ def test_a_grasp_moves_as_one_and_a_frame_only_by_its_slack() -> None:
 def test_finding_again_changes_nothing() -> None:
     scene = turning_scene(wander=0.0008)
     find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
-    before = {side: scene.hand_points(side, ALL)[1] for side in scene.sides}
+    before = {side: scene.at(ALL).joints(side) for side in scene.sides}
     find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
     for side in scene.sides:
-        torch.testing.assert_close(scene.hand_points(side, ALL)[1], before[side], atol=1e-5, rtol=0)
+        torch.testing.assert_close(scene.at(ALL).joints(side), before[side], atol=1e-5, rtol=0)
 
 
 def test_a_hand_that_holds_nothing_stays_where_it_was() -> None:
@@ -133,19 +133,19 @@ def test_a_hand_that_holds_nothing_stays_where_it_was() -> None:
     with torch.no_grad():
         scene.hand_poses["right"].pose[:, 3, 2] = 0.2
         scene.hand_poses["right"].pose_bias[4, 1] = 0.1
-    before = scene.hand_points("right", ALL)[1]
+    before = scene.at(ALL).joints("right")
     assert find_grasps(scene, STAGE, {"right": torch.zeros(FRAMES), "left": torch.zeros(FRAMES)}) == {
         "right": [],
         "left": [],
     }
-    torch.testing.assert_close(scene.hand_points("right", ALL)[1], before, atol=1e-6, rtol=0)
+    torch.testing.assert_close(scene.at(ALL).joints("right"), before, atol=1e-6, rtol=0)
     assert not scene.hand_poses["right"].pose.any(), "residuals became the start"
 
 
 def test_gradients_of_a_held_hand_reach_grasp_and_object() -> None:
     scene = turning_scene()
     find_grasps(scene, STAGE, EVERYWHERE)
-    scene.hand_points("right", torch.tensor([2]))[1].square().sum().backward()
+    scene.at(torch.tensor([2])).joints("right").square().sum().backward()
     grasps = scene.grasps["right"]
     for parameter in (grasps.orient, grasps.pose, grasps.position):
         assert parameter.grad[0].abs().max() > 0 and not parameter.grad[1:].any()

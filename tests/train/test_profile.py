@@ -9,6 +9,7 @@ import torch
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
+from bigs.models.moments import Moments
 from bigs.models.scene import Scene
 from bigs.train import step, terms
 from bigs.train.config import OptimizeStage, RunConfig
@@ -94,11 +95,11 @@ def test_a_stage_lasts_until_the_next(clock: Clock) -> None:
 
 def test_a_run_in_a_profile(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
     config = short(PRESETS["smoke"], "hands-coarse", "joint")
-    before = (Scene.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
+    before = (Moments.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
     plain, _ = fit(tiny, both_hands, config)
     with profiled() as profile:
         timed, _ = fit(tiny, both_hands, config, listen=profile.listen)
-    after = (Scene.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
+    after = (Moments.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
     assert after == before
 
     for (name, one), (_, other) in zip(plain.state_dict().items(), timed.state_dict().items(), strict=True):

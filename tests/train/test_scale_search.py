@@ -27,10 +27,10 @@ def test_recovers_a_known_size(both_hands: dict[Side, HandModel], size: float) -
     assert len(factors) == len(costs) == STAGE.candidates
     assert scene.object_poses.log_scale.exp().item() == pytest.approx(factor)
     assert costs.min() < 0.5 * costs.max()
-    pose = scene.object_frames(torch.arange(3))
+    pose = scene.at(torch.arange(3)).object
     # Size and depth change together, so the cube is where it truly is, too.
     torch.testing.assert_close(pose.centers[0], torch.tensor(CENTER), atol=CENTER[2] * GRID_STEP, rtol=0)
-    corner = scene.object_points(scene.object_surface.verts, torch.arange(3)) - pose.centers[:, None]
+    corner = scene.at(torch.arange(3)).object_points(scene.object_surface.verts) - pose.centers[:, None]
     assert corner.abs().max().item() == pytest.approx(HALF, abs=HALF * 1.1 * GRID_STEP)
 
 
@@ -38,9 +38,9 @@ def test_leaves_the_projection_alone(both_hands: dict[Side, HandModel]) -> None:
     scene = cube_scene(both_hands, 0.9)
     frames = torch.arange(3)
     with torch.no_grad():
-        before = scene.object_points(scene.object_surface.verts, frames)
+        before = scene.at(frames).object_points(scene.object_surface.verts)
         search_object_scale(scene, STAGE, touching())
-        after = scene.object_points(scene.object_surface.verts, frames)
+        after = scene.at(frames).object_points(scene.object_surface.verts)
     assert not torch.allclose(before, after, atol=1e-3)
     torch.testing.assert_close(before[..., :2] / before[..., 2:], after[..., :2] / after[..., 2:])
 

@@ -1,0 +1,126 @@
+"""The poses of some frames, each worked out once however many terms of a step ask for it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from bigs.hand import Skeleton, mirror_points
+from bigs.models.hand_splats import CanonicalHand, pose_splats
+from bigs.models.object_splats import CanonicalObject, pose_object
+from bigs.models.poses import HandFrames, ObjectFrames
+from bigs.types import Entity, Gaussians, Side
+
+if TYPE_CHECKING:
+    from bigs.models.scene import Scene
+
+
+class Moments:
+    """A scene at some frames, differentiable; valid until a parameter changes."""
+
+    def __init__(self, scene: Scene, frames: Tensor, of: Moments | None = None) -> None:
+        """
+        Args:
+            scene: whose poses.
+            frames: [B] indices.
+            of: the moments of the whole clip, from which these are taken.
+        """
+        self._scene, self.frames, self._of = scene, frames, of
+        self._hands: dict[Side, HandFrames] = {}
+        self._skeletons: dict[Side, Skeleton] = {}
+
+    def at(self, frames: Tensor) -> Moments:
+        """Some frames [B] of these, which have to be the whole clip's; what both need is shared."""
+        return Moments(self._scene, frames, self)
+
+    @cached_property
+    def object(self) -> ObjectFrames:
+        """The object's poses."""
+        if self._of is None:
+            return self._scene.object_poses(self.frames)
+        whole = self._of.object
+        return ObjectFrames(whole.rotations[self.frames], whole.centers[self.frames], whole.scale)
+
+    def hand(self, side: Side) -> HandFrames:
+        """Poses of the canonical hand with the wrist where it is; in a grasp the object carries the hand."""
+        if side not in self._hands:
+            self._hands[side] = (
+                self._own_hand(side)
+                if self._of is None
+                else HandFrames(*(part[self.frames] for part in self._of.hand(side)))
+            )
+        return self._hands[side]
+
+    def canonical_hand(self, side: Side) -> HandFrames:
+        """The same as poses of the right hand: a left hand's wrist is seen in the mirror."""
+        pose = self.hand(side)
+        return pose._replace(wrist=mirror_points(pose.wrist)) if side == "left" else pose
+
+    def verts(self, side: Side) -> Tensor:
+        """Vertices [B, V, 3] of a hand in camera space, metres."""
+        return self._skinned(side, None)
+
+    def joints(self, side: Side) -> Tensor:
+        """The 21 joints [B, 21, 3] of a hand in camera space, metres."""
+        joints = self._skeleton(side).joints
+        joints = mirror_points(joints) if side == "left" else joints
+        return torch.cat([joints, self._skinned(side, self._scene.hand_model(side).tip_vertex_ids)], dim=1)
+
+    def object_points(self, points: Tensor) -> Tensor:
+        """Points [N, 3] of the object's own frame in camera space: [B, N, 3]."""
+        pose = self.object
+        return pose.scale * points @ pose.rotations.transpose(-1, -2) + pose.centers[:, None]
+
+    def in_object_frame(self, points: Tensor) -> Tensor:
+        """Camera points [B, N, 3] in the object's own frame (metres at the initial size)."""
+        pose = self.object
+        return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
+
+    def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject) -> Gaussians:
+        """Gaussians of one entity in camera space, lit: means [B, N, 3], quats [B, N, 4]."""
+        posed = (
+            pose_object(canonical, self.object) if entity == "object" else self.posed_hand(entity, canonical)
+        )
+        if self._scene.lighting is None:
+            return posed
+        # Light has no say in how a hand bends.
+        return self._scene.lighting(entity, posed, self.frames, canonical.weights.detach())
+
+    def posed_hand(self, side: Side, hand: CanonicalHand) -> Gaussians:
+        """Any Gaussians of the canonical hand, unlit."""
+        bones, betas = self._skeleton(side).bone_transforms, self._scene.hand_betas(side)
+        return pose_splats(hand, betas, self.hand(side).hand_pose, bones, side)
+
+    def _skinned(self, side: Side, vertices: Tensor | None) -> Tensor:
+        skeleton, pose = self._skeleton(side), self.hand(side).hand_pose
+        verts = self._scene.hand_model(side).skin(skeleton, pose, vertices)
+        return mirror_points(verts) if side == "left" else verts
+
+    def _own_hand(self, side: Side) -> HandFrames:
+        poses, grasps = self._scene.hand_poses[side], self._scene.grasps[side]
+        held = grasps.held(self.frames)
+        if not held.any():
+            return poses(self.frames)
+        carried, own = grasps(self.frames, self.object), poses.start(self.frames)
+        start = (
+            torch.where(held.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            for a, b in zip(carried, own, strict=True)
+        )
+        return poses(self.frames, HandFrames(*start), torch.where(held, grasps.slack, 1.0))
+
+    def _skeleton(self, side: Side) -> Skeleton:
+        """The canonical hand's bones."""
+        if side not in self._skeletons:
+            if self._of is None:
+                model, betas = self._scene.hand_model(side), self._scene.hand_betas(side)
+                pose = self.canonical_hand(side)
+                self._skeletons[side] = model.skeleton(betas, pose.hand_pose, pose.global_orient, pose.wrist)
+            else:
+                whole = self._of._skeleton(side)
+                self._skeletons[side] = Skeleton(
+                    whole.shaped, whole.joints[self.frames], whole.bone_transforms[self.frames]
+                )
+        return self._skeletons[side]
