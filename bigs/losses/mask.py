@@ -47,9 +47,10 @@ def amodal_silhouette(alpha: Tensor, own: Tensor, hidden: Tensor) -> Tensor:
         own: [B, H, W] visible share of each pixel in [0, 1].
         hidden: [B, H, W] share in which the subject may be hidden.
     """
-    missing = (own - alpha).clamp_min(0.0)
-    excess = (alpha - own - hidden).clamp_min(0.0)
-    return (missing.square() + excess.square()).sum() / own.sum().clamp_min(1.0)
+    # The nearest allowed alpha is alpha itself where nothing is wrong and a constant elsewhere: detached, it
+    # gives the same gradient in half the passes over the images.
+    nearest = torch.clamp(alpha.detach(), own, own + hidden)
+    return (alpha - nearest).square().sum() / own.sum().clamp_min(1.0)
 
 
 def label_difference(pred: Tensor, labels: Tensor) -> Tensor:

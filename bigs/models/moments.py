@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bigs.hand import Skeleton, mirror_points
 from bigs.models.hand_splats import CanonicalHand, pose_splats
+from bigs.models.lighting import third_axis
 from bigs.models.object_splats import CanonicalObject, pose_object
 from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.types import Entity, Gaussians, Side
@@ -81,13 +82,18 @@ class Moments:
 
     def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject) -> Gaussians:
         """Gaussians of one entity in camera space, lit: means [B, N, 3], quats [B, N, 4]."""
-        posed = (
-            pose_object(canonical, self.object) if entity == "object" else self.posed_hand(entity, canonical)
-        )
-        if self._scene.lighting is None:
+        lighting, normals = self._scene.lighting, None
+        if entity == "object":
+            posed = pose_object(canonical, self.object)
+            if lighting is not None:
+                # One matrix product instead of a formula in each frame's quaternions.
+                normals = third_axis(canonical.quats) @ self.object.rotations.transpose(-1, -2)
+        else:
+            posed = self.posed_hand(entity, canonical)
+        if lighting is None:
             return posed
         # Light has no say in how a hand bends.
-        return self._scene.lighting(entity, posed, self.frames, canonical.weights.detach())
+        return lighting(entity, posed, self.frames, canonical.weights.detach(), normals)
 
     def posed_hand(self, side: Side, hand: CanonicalHand) -> Gaussians:
         """Any Gaussians of the canonical hand, unlit."""

@@ -73,19 +73,30 @@ class Step:
 
     @cached_property
     def images(self) -> Tensor:
-        return self.evidence.targets.images[self.frames]
+        return _at(self.evidence.targets.images, self.frames)
 
     @cached_property
     def foreground(self) -> Tensor:
-        return self.evidence.targets.foreground(self.frames)
+        return _at(self.evidence.targets.foreground, self.frames)
 
     def share(self, entity: Entity) -> Tensor:
-        return self.evidence.targets.shares[entity][self.frames]
+        return _at(self.evidence.targets.shares[entity], self.frames)
 
-    def seen_alone(self, entity: Entity) -> tuple[Tensor, Tensor]:
-        """Images and the subject's share of their pixels where it is looked at alone."""
-        targets, frames = self.evidence.targets, self.frames_of(entity)
-        return targets.images[frames], targets.shares[entity][frames]
+    def images_alone(self, entity: Entity) -> Tensor:
+        """The images in which a subject is looked at alone."""
+        return _at(self.evidence.targets.images, self.frames_of(entity))
+
+    def share_alone(self, entity: Entity) -> Tensor:
+        """The subject's share of their pixels."""
+        return _at(self.evidence.targets.shares[entity], self.frames_of(entity))
+
+    def hidden_alone(self, entity: Entity) -> Tensor:
+        """The share of their pixels in which something else may hide it."""
+        return _at(self.evidence.targets.hidden[entity], self.frames_of(entity))
+
+    def foreground_alone(self, entity: Entity) -> Tensor:
+        """The share of their pixels that shows any subject."""
+        return _at(self.evidence.targets.foreground, self.frames_of(entity))
 
     def generator(self) -> torch.Generator:
         """A fresh one for each term, so that what one term draws does not depend on the others."""
@@ -102,7 +113,8 @@ class Step:
             targets.height,
             settings=self.evidence.settings,
         )
-        return RenderOutput(out.colors[:, 0], out.alphas[:, 0], out.info)
+        # Not [:, 0], whose gradient would be copied into zeros.
+        return RenderOutput(out.colors.squeeze(1), out.alphas.squeeze(1), out.info)
 
     def alone(self, entity: Entity) -> RenderOutput:
         """One subject rendered without the others (the paper's single-subject step)."""
@@ -128,7 +140,7 @@ class Step:
     def pixels(self) -> Pixels:
         """For terms that look at each pixel for itself: hands and object fill a small part of an image."""
         rendered, foreground = self.together, self.foreground
-        counts = (foreground > 0.0) | (rendered.alphas[..., 0] > 0.0)
+        counts = (foreground > 0.0) | (rendered.alphas.squeeze(-1) > 0.0)
         index = torch.nonzero(counts.flatten()).flatten()
 
         def some(values: Tensor) -> Tensor:
@@ -156,3 +168,8 @@ class Step:
     @property
     def has_object(self) -> bool:
         return self.scene.object_splats is not None
+
+
+def _at(values: Tensor, frames: Tensor) -> Tensor:
+    """Values [T, ...] of `frames` [B], which rise: all of them are not worth a copy."""
+    return values if len(frames) == len(values) else values[frames]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,14 +25,20 @@ class Targets:
     width: int
     height: int
 
-    def foreground(self, frames: Tensor) -> Tensor:
-        """Share of each pixel that shows any entity, in `frames` [B]: [B, H, W]."""
-        return torch.stack([share[frames] for share in self.shares.values()]).sum(0).clamp(max=1.0)
+    @cached_property
+    def foreground(self) -> Tensor:
+        """Share of each pixel that shows any entity: [T, H, W]."""
+        return sum(self.shares.values(), torch.zeros(())).clamp(max=1.0)
 
-    def hidden(self, entity: Entity, frames: Tensor) -> Tensor:
-        """Share of each pixel in which something else may hide this entity, in `frames` [B]: [B, H, W]."""
-        others = [share[frames] for other, share in self.shares.items() if other != entity]
-        return torch.stack([self.unknown[frames], *others]).sum(0).clamp(max=1.0)
+    @cached_property
+    def hidden(self) -> dict[Entity, Tensor]:
+        """Share of each pixel in which something else may hide an entity: [T, H, W]."""
+        return {
+            entity: sum(
+                (share for other, share in self.shares.items() if other != entity), self.unknown
+            ).clamp(max=1.0)
+            for entity in self.shares
+        }
 
 
 def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:

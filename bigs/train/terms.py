@@ -14,7 +14,7 @@ from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.train.step import Step
-from bigs.types import Entity, Side
+from bigs.types import Side
 
 
 def _mean(values: Iterable[Tensor]) -> Tensor:
@@ -23,7 +23,10 @@ def _mean(values: Iterable[Tensor]) -> Tensor:
 
 
 def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
-    return _mean(loss(step.alone(entity).colors, *step.seen_alone(entity)) for entity in step.entities)
+    return _mean(
+        loss(step.alone(entity).colors, step.images_alone(entity), step.share_alone(entity))
+        for entity in step.entities
+    )
 
 
 def image_alone(step: Step) -> Tensor:
@@ -38,13 +41,9 @@ def ssim_alone(step: Step) -> Tensor:
     return _each_alone(step, masked_ssim)
 
 
-def _foreground_alone(step: Step, entity: Entity) -> Tensor:
-    return step.evidence.targets.foreground(step.frames_of(entity))
-
-
 def mask_alone(step: Step) -> Tensor:
     return _mean(
-        outside_mask(step.alone(entity).colors, _foreground_alone(step, entity)) for entity in step.entities
+        outside_mask(step.alone(entity).colors, step.foreground_alone(entity)) for entity in step.entities
     )
 
 
@@ -54,7 +53,7 @@ def mask_random_alone(step: Step) -> Tensor:
         outside_mask_on(
             step.alone(entity).colors,
             step.alone(entity).alphas,
-            _foreground_alone(step, entity),
+            step.foreground_alone(entity),
             generator,
         )
         for entity in step.entities
@@ -65,7 +64,11 @@ def perceptual_alone(step: Step) -> Tensor:
     generator = step.generator()
     return _mean(
         masked_perceptual(
-            step.alone(entity).colors, *step.seen_alone(entity), step.evidence.perceptual, generator
+            step.alone(entity).colors,
+            step.images_alone(entity),
+            step.share_alone(entity),
+            step.evidence.perceptual,
+            generator,
         )
         for entity in step.entities
     )
@@ -73,13 +76,12 @@ def perceptual_alone(step: Step) -> Tensor:
 
 def coverage_alone(step: Step) -> Tensor:
     """Each subject opaque on its own pixels, absent from the background, free where others may hide it."""
-    targets = step.evidence.targets
-
-    def one(entity: Entity) -> Tensor:
-        hidden = targets.hidden(entity, step.frames_of(entity))
-        return amodal_silhouette(step.alone(entity).alphas[..., 0], step.seen_alone(entity)[1], hidden)
-
-    return _mean(one(entity) for entity in step.entities)
+    return _mean(
+        amodal_silhouette(
+            step.alone(entity).alphas.squeeze(-1), step.share_alone(entity), step.hidden_alone(entity)
+        )
+        for entity in step.entities
+    )
 
 
 def image_together(step: Step) -> Tensor:
@@ -122,10 +124,9 @@ def silhouette(step: Step) -> Tensor:
     """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
 
     def one(side: Side) -> Tensor:
-        evidence, frames = step.evidence, step.frames_of(side)
-        posed = step.clip.at(frames).posed_hand(side, evidence.silhouettes[side])
-        hidden = evidence.targets.hidden(side, frames)
-        return amodal_silhouette(step.render(posed).alphas[..., 0], step.seen_alone(side)[1], hidden)
+        posed = step.clip.at(step.frames_of(side)).posed_hand(side, step.evidence.silhouettes[side])
+        alphas = step.render(posed).alphas.squeeze(-1)
+        return amodal_silhouette(alphas, step.share_alone(side), step.hidden_alone(side))
 
     return _mean(one(side) for side in step.scene.sides if len(step.frames_of(side)))
 

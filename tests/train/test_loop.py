@@ -185,7 +185,7 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     frames = torch.tensor([0, 2])
     step = Step(scene, evidence, scene.entities, scene.canonical(scene.entities), frames)
     assert 0 < len(step.pixels.colors) < 2 * 30 * 40
-    rendered, foreground = step.together.colors, evidence.targets.foreground(frames)
+    rendered, foreground = step.together.colors, evidence.targets.foreground[frames]
     labels = torch.stack([shares[entity][frames] for entity in scene.entities], dim=-1)
     images = targets.images[frames]
     whole = {

@@ -80,8 +80,8 @@ def test_shares_are_shares(tiny: Clip) -> None:
     assert set(targets.shares) == {"right", "left", "object"}
     total = torch.stack(list(targets.shares.values())).sum(0)
     frames = torch.arange(len(tiny))
-    foreground = targets.foreground(frames)
-    for values in (*targets.shares.values(), targets.unknown, foreground, targets.hidden("right", frames)):
+    foreground = targets.foreground[frames]
+    for values in (*targets.shares.values(), targets.unknown, foreground, targets.hidden["right"][frames]):
         assert values.min() >= 0 and values.max() <= 1 + 1e-6
     assert total.max() <= 1 + 1e-5
     assert foreground.max() > 0.99
@@ -97,7 +97,7 @@ def test_hidden_is_everything_else(tiny: Clip) -> None:
     targets = load_targets(tiny, nothing, 0.5, crop_box(tiny))
     frames = torch.tensor([2, 0])
     others = (targets.shares["right"] + targets.shares["object"])[frames]
-    torch.testing.assert_close(targets.hidden("left", frames), others)
+    torch.testing.assert_close(targets.hidden["left"][frames], others)
 
 
 def test_the_box_holds_everything_with_a_margin(clip: Clip, tiny: Clip) -> None:
