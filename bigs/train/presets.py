@@ -86,7 +86,7 @@ _APPEARANCE = OptimizeStage(
         "scene.light": 1e-2,
         "scene.shade": 1e-2,
     },
-    weights={"image": 1.0, "ssim": 0.2, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0, "lbs": 1000.0},
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0, "lbs": 1000.0},
     image_size=240,
     frames_per_step=6,
 )
