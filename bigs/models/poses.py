@@ -79,6 +79,10 @@ class HandPoses(nn.Module):
         self.register_buffer("base_pose", hand_pose)
         # What was known before any image was looked at; `base_pose` moves on.
         self.register_buffer("estimated_pose", hand_pose.clone())
+        self.register_buffer("estimated_log_depth", wrist[:, 2].log())
+        # What logarithmic depth to expect of a frame, and of which frames anything is to be expected.
+        self.register_buffer("expected_log_depth", torch.zeros(frames))
+        self.register_buffer("has_expected_depth", torch.zeros(frames, dtype=torch.bool))
         self.orient = nn.Parameter(torch.zeros(frames, 3))
         self.pose = nn.Parameter(torch.zeros(frames, 15, 3))
         # What a per-frame regressor gets wrong in every frame alike.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,7 +57,8 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
     """Find the grasps of every hand in the scene as it is, and let the object carry the hand through them.
 
     All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
-    estimates, corrected as those of the nearest grasps had to be.
+    estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an
+    outline tells them (see `expected_depths`).
     """
     frames = torch.arange(scene.n_frames)
     found = {}
@@ -69,7 +71,10 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
         poses, own = scene.at(frames).hand(side), scene.hand_poses[side]
         scene.grasps[side].set(of_frame, stage.slack, poses, scene.at(frames).object)
         held = scene.grasps[side].held(frames)
+        own.has_expected_depth.copy_(~held & held.any())
         if held.any():
+            log_depth = poses.wrist[:, 2].log()
+            own.expected_log_depth.copy_(expected_depths(log_depth, own.estimated_log_depth, held))
             correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
             corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, held))
             poses = poses._replace(
@@ -114,6 +119,25 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
         share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
         orient[between] = carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * turn)
     return orient
+
+
+def expected_depths(log_depth: Tensor, estimated: Tensor, held: Tensor) -> Tensor:
+    """Logarithmic depths [T] that frames outside grasps are expected to have.
+
+    An outline says little of the depth of a hand that the image cuts off. Two guesses with unrelated errors
+    say more together: the way from one grasp straight to the next, and the estimate less the errors that
+    grasps have shown it to have.
+
+    Args:
+        log_depth: [T] as found; only those of grasps are read.
+        estimated: [T] before any image was looked at.
+        held: [T] bool, which frames are in grasps; at least one.
+    """
+    times = np.arange(len(held))
+    known = held.numpy()
+    between = torch.from_numpy(np.interp(times, times[known], log_depth.numpy()[known])).to(log_depth)
+    carried = estimated + carried_errors(log_depth - estimated, held)
+    return 0.5 * (between + carried)
 
 
 def carried_errors(errors: Tensor, known: Tensor, width: float = 10.0, noise: float = 1.0) -> Tensor:

@@ -98,7 +98,7 @@ _REGRASP = OptimizeStage(
     step="single-subject",
     steps=90,
     lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
-    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002},
+    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
     image_size=160,
     free_frames=True,
 )
@@ -149,6 +149,7 @@ _JOINT = OptimizeStage(
         **_POSE_PRIORS,
         # Colours now say what the prior had to say before.
         "pose_prior": 0.2,
+        "depth_prior": 12.0,
         "rigid": 0.03,
         "contact": 0.1,
         "penetration": 0.01,
@@ -164,7 +165,7 @@ _JOINT = OptimizeStage(
 _DETAIL = replace(
     _JOINT,
     name="detail",
-    steps=100,
+    steps=150,
     lrs={
         **_JOINT.lrs,
         "hand.orient": 0.002,
@@ -239,10 +240,10 @@ FULL = replace(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=100),
-        replace(_REGRASP, steps=300),
+        replace(_REGRASP, steps=200),
         SplitStage(),
-        replace(_JOINT, steps=500),
-        replace(_DETAIL, steps=900, image_size=640),
+        replace(_JOINT, steps=300),
+        replace(_DETAIL, steps=800, image_size=640),
         CompletionStage(),
         GuidanceStage(steps=600),
     ),

@@ -189,8 +189,8 @@ _INGREDIENTS = {
         _all_of(_terms("labels"), _search_labels),
     ),
     "pose_priors": Switch(
-        "the pull of poses and shape to their estimates",
-        _terms("orient_prior", "pose_prior", "betas_prior", "object_prior"),
+        "the pull of poses, depths and shape to their estimates",
+        _terms("orient_prior", "pose_prior", "depth_prior", "betas_prior", "object_prior"),
     ),
     "hand_geometry": Switch(
         "what moves, turns and scales the hand's Gaussians",

@@ -192,6 +192,17 @@ def pose_prior(step: Step) -> Tensor:
     )
 
 
+def depth_prior(step: Step) -> Tensor:
+    """Squared relative distance from the depth that a frame outside grasps is expected to have."""
+
+    def one(side: Side) -> Tensor:
+        poses = step.scene.hand_poses[side]
+        away = step.clip.hand(side).wrist[:, 2].log() - poses.expected_log_depth
+        return (poses.has_expected_depth * away.square()).mean()
+
+    return _mean(one(side) for side in step.scene.sides)
+
+
 def betas_prior(step: Step) -> Tensor:
     """Squared change of shape from the start, in the units of betas."""
     return _mean(
@@ -278,6 +289,7 @@ TERMS: dict[str, Callable[[Step], Tensor]] = {
     "object_acceleration": object_acceleration,
     "orient_prior": orient_prior,
     "pose_prior": pose_prior,
+    "depth_prior": depth_prior,
     "betas_prior": betas_prior,
     "object_prior": object_prior,
     "shade_prior": shade_prior,

@@ -13,8 +13,10 @@ from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, 
 from bigs.hand import mirror_rotation, procedural_hand
 from bigs.models.scene import Scene
 from bigs.train.config import GraspStage, RunConfig
-from bigs.train.grasps import carried_errors, find_grasps, still_frames, turned_between
+from bigs.train.grasps import carried_errors, expected_depths, find_grasps, still_frames, turned_between
 from bigs.train.plan import check_plan
+from bigs.train.step import Step
+from bigs.train.terms import depth_prior
 
 STAGE = GraspStage()
 FRAMES = 24
@@ -162,6 +164,32 @@ def test_known_errors_are_carried_to_their_neighbours_and_fade_to_the_mean() -> 
     torch.testing.assert_close(carried[29] + carried[30], torch.zeros(2), atol=1e-4, rtol=0)
     constant = carried_errors(torch.ones(60, 2), known, noise=0.1)
     assert (constant - 1.0).abs().max() < 0.25, "what every known frame shows, all have"
+
+
+def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
+    held = torch.zeros(30, dtype=torch.bool)
+    held[:10] = held[20:] = True
+    true = torch.linspace(-0.5, -0.3, 30)
+    wave = 0.1 * torch.sin(torch.arange(30.0))
+    # An estimate that is wrong by the same everywhere, and one that wavers: half of its waver is believed.
+    for estimated, believed in ((true + 0.2, torch.zeros(30)), (true + 0.2 + wave * ~held, 0.5 * wave)):
+        expected = expected_depths(true, estimated, held)
+        torch.testing.assert_close(expected[~held], (true + believed)[~held], atol=0.02, rtol=0)
+
+
+def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
+    scene = cube_scene({"right": procedural_hand()})
+    step = Step(scene, None, (), {}, torch.arange(3))
+    poses = scene.hand_poses["right"]
+    assert depth_prior(step) == 0, "nothing is expected of anything yet"
+    with torch.no_grad():
+        poses.expected_log_depth[1] = poses.position.base_log_depth[1] + 0.1
+        poses.has_expected_depth[1] = True
+    loss = depth_prior(Step(scene, None, (), {}, torch.arange(3)))
+    torch.testing.assert_close(loss, torch.tensor(0.01 / 3 / len(scene.sides)))
+    loss.backward()
+    gradient = poses.position.log_depth.grad
+    assert gradient[1] < 0 and gradient.isfinite().all() and not gradient[[0, 2]].any()
 
 
 def test_a_hand_turns_evenly_from_grasp_to_grasp_as_seen_from_the_object() -> None:
