@@ -138,6 +138,7 @@ def test_ingredients_are_left_out(
         ("raster.eps2d=[", ["--set raster.eps2d=["]),
         ("raster.eps2d=-1", ["eps2d", "expected", "found -1"]),
         ("raster.tile_size=12", ["tile_size", "expected 4, 8 or 16", "found 12"]),
+        ("raster.exp_degree=6", ["exp_degree", "expected 3, 4 or 5", "found 6"]),
         ("stages.joint.weights.typo=1", ["joint", "expected terms out of", "found 'typo'"]),
         ("stages.joint.lrs.hand.typo=1", ["expected groups out of", "found 'hand.typo'"]),
         ("stages.joint.image_size=-2", ["image_size", "expected", "found -2"]),

@@ -38,6 +38,7 @@ SETTINGS: tuple[Point, ...] = (
         {"1e-4": 1e-4, "1/1024": 1 / 1024, "1/255": 1 / 255, "1/128": 1 / 128, "1/64": 1 / 64},
     ),
     *_points("min_transmittance", {"0": 0.0, "1e-5": 1e-5, "1e-4": 1e-4, "1e-3": 1e-3, "1e-2": 1e-2}),
+    *_points("exp_degree", {"3": 3, "4": 4, "5": 5}),
     *_points("tile_size", {"4": 4, "8": 8, "16": 16}),
     *_points("dtype", {"float32": "float32", "float64": "float64"}),
 )

@@ -13,7 +13,7 @@ from bigs.checks import InputError
 from bigs.raster.settings import RasterSettings
 
 # gsplat has these as constants of its kernels.
-_FIXED = ("alpha_threshold", "max_alpha", "min_transmittance")
+_FIXED = ("alpha_threshold", "max_alpha", "min_transmittance", "exp_degree")
 
 
 def _gsplat() -> ModuleType:

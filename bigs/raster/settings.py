@@ -25,5 +25,8 @@ class RasterSettings:
     """Alpha is limited to this, so that transmittance never reaches 0 and gradients stay finite."""
     min_transmittance: float = 1e-4
     """A pixel stops before the Gaussian that would bring its transmittance to this or less. 0 never stops."""
+    exp_degree: int = 5
+    """Degree of the polynomial for powers of two: 3, 4 or 5; relative errors of alpha are 1e-4, 3e-6, 1e-7.
+    float64 has one of degree 12, and only takes 5 here."""
     antialiased: bool = False
     """Scale opacities by what `eps2d` added to the area (Mip-Splatting): thin ones do not grow brighter."""

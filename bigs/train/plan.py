@@ -35,7 +35,7 @@ _LEAST_OF_STAGE: Mapping[type, Mapping[str, float]] = {
     GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0},
 }
 # What the renderer is compiled for.
-TILE_SIZES = (4, 8, 16)
+COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}
 
 
 def check_plan(config: RunConfig) -> None:
@@ -60,11 +60,11 @@ def check_plan(config: RunConfig) -> None:
                 raise InputError(
                     f"{where}: expected free_frames with step single-subject, found {stage.step}"
                 )
-    if config.raster.tile_size not in TILE_SIZES:
-        raise InputError(
-            f"config raster.tile_size: expected {TILE_SIZES[0]}, {TILE_SIZES[1]} or {TILE_SIZES[2]}, "
-            f"found {config.raster.tile_size}"
-        )
+    for name, (*others, last) in COMPILED.items():
+        value = getattr(config.raster, name)
+        if value not in (*others, last):
+            known = ", ".join(map(str, others))
+            raise InputError(f"config raster.{name}: expected {known} or {last}, found {value}")
 
 
 def _check_names(where: str, stage: OptimizeStage) -> None:

@@ -211,6 +211,7 @@ def layers() -> dict[str, Any]:
 NO_STOP = RasterSettings(min_transmittance=0.0)
 # Every pair counts, so no rounding moves one over a threshold.
 SOFT = RasterSettings(alpha_threshold=1e-7, min_transmittance=0.0)
+SOFT_ANTIALIASED = RasterSettings(alpha_threshold=1e-7, min_transmittance=0.0, antialiased=True)
 THRESHOLD = 1.0 / 255.0
 
 HOSTILE: dict[str, Hostile] = {
@@ -218,6 +219,9 @@ HOSTILE: dict[str, Hostile] = {
     "scales 1e-41": Hostile(with_odd("scales", [1e-41] * 3, [1e-41, 0.1, 0.1])),
     "scales 1e-12": Hostile(with_odd("scales", [1e-12] * 3, [1e-12, 0.1, 0.1])),
     "scales 1e3": Hostile(with_odd("scales", [1e3] * 3, [1e3, 0.1, 10.0]), SOFT),
+    "scales 1e4, antialiased": Hostile(
+        with_odd("scales", [1e4] * 3, [1e4, 3e3, 3e3], [5e3, 9e3, 1.0]), SOFT_ANTIALIASED
+    ),
     "scales 1e6": Hostile(with_odd("scales", [1e6] * 3, [1e6, 0.1, 10.0]), SOFT),
     "scales 1e12": Hostile(with_odd("scales", [1e12] * 3, [1e12, 0.1, 10.0]), SOFT),
     "scales 1e30": Hostile(with_odd("scales", [1e30] * 3, [1e30, 1e30, 1e20]), SOFT),

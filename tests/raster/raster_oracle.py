@@ -59,10 +59,15 @@ def footprints(inputs: dict[str, Any], settings: RasterSettings) -> Footprints:
     eps = settings.eps2d
     area = torch.linalg.cross(r0, r1).square().sum(-1)
     b, c = (r0 * r1).sum(-1), r1.square().sum(-1) + eps
-    det = area + eps * (r0.square().sum(-1) + r1.square().sum(-1)) + eps * eps
+    blur = eps * (r0.square().sum(-1) + r1.square().sum(-1)) + eps * eps
+    det = area + blur
     root = (c / det).sqrt()
     if settings.antialiased:
-        opacities = opacities * (area / det).sqrt()
+        # √(area / det) in two forms: the gradient of the second cancels where the blur is little.
+        wide = area > blur
+        among_wide, among_thin = torch.where(wide, area, 1.0), torch.where(wide, 1.0, area)
+        compensation = torch.where(wide, (1 + blur / among_wide).rsqrt(), (among_thin / det).sqrt())
+        opacities = opacities * compensation
     return Footprints(ids, means2d, z, rows, torch.stack([root, -root * b / c, c**-0.5], -1), opacities)
 
 

@@ -98,6 +98,8 @@ def test_cameras_are_named():
     ("change", "words"),
     [
         ({"tile_size": 12}, "settings.tile_size: expected 4, 8 or 16"),
+        ({"exp_degree": 2}, "settings.exp_degree: expected 3, 4 or 5"),
+        ({"exp_degree": 4}, "settings.exp_degree: expected 5 with 64-bit floats"),
         ({"max_alpha": 1.0}, r"settings.max_alpha: expected a number in \(0, 1\)"),
         ({"alpha_threshold": -0.1}, "settings.alpha_threshold"),
         ({"min_transmittance": 1.0}, "settings.min_transmittance"),

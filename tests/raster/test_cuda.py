@@ -76,9 +76,9 @@ def test_gsplat_receives_the_layout(fake, means2d, absgrad):
     assert fake.layout == (means2d == "packed", absgrad)
 
 
-@pytest.mark.parametrize("name", ["max_alpha", "alpha_threshold", "min_transmittance"])
+@pytest.mark.parametrize("name", ["max_alpha", "alpha_threshold", "min_transmittance", "exp_degree"])
 def test_gsplats_constants_are_named(fake, name):
-    settings = dataclasses.replace(RasterSettings(), **{name: 0.5})
+    settings = dataclasses.replace(RasterSettings(), **{name: 4 if name == "exp_degree" else 0.5})
     with pytest.raises(InputError, match=rf"settings\.{name}: expected gsplat's constant"):
         rasterization(**scene(), settings=settings, backend="gsplat")
 

@@ -65,6 +65,7 @@ struct Settings {
     alpha_threshold: f64,
     max_alpha: f64,
     min_transmittance: f64,
+    exp_degree: u32,
     antialiased: bool,
 }
 
@@ -79,6 +80,7 @@ impl From<Settings> for RasterSettings {
             alpha_threshold: s.alpha_threshold,
             max_alpha: s.max_alpha,
             min_transmittance: s.min_transmittance,
+            exp_degree: s.exp_degree,
             antialiased: s.antialiased,
         }
     }
@@ -332,6 +334,7 @@ fn default_settings(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     dict.set_item("alpha_threshold", s.alpha_threshold)?;
     dict.set_item("max_alpha", s.max_alpha)?;
     dict.set_item("min_transmittance", s.min_transmittance)?;
+    dict.set_item("exp_degree", s.exp_degree)?;
     dict.set_item("antialiased", s.antialiased)?;
     Ok(dict)
 }

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
+use crate::bins::{BinScratch, TileBins, bin_tiles};
 use crate::chunk::{CHUNK, ChunkSplats};
 use crate::dispatch::SimdLevel;
 use crate::error::RasterError;
@@ -12,7 +13,7 @@ use crate::pool::{Buffers, bytes_of, stale};
 use crate::project::{Lens, ScreenInfo, Splat};
 use crate::real::Real;
 use crate::settings::Limits;
-use crate::tiles::{BinScratch, Cover, TileBins, TileGrid, bin_tiles};
+use crate::tiles::{Cover, TileGrid};
 use crate::view::View;
 
 /// (Gaussian, tile) pairs that are listed while projecting. With more, the rest is first only counted: should they be

@@ -6,6 +6,7 @@
 //! not generic.
 
 use crate::binned::Binned;
+use crate::bins::BinScratch;
 use crate::composite::{Canvas, composite};
 use crate::composite_vjp::{CompositeGradients, Cotangents, composite_vjp};
 use crate::error::RasterError;
@@ -19,7 +20,7 @@ use crate::real::Real;
 use crate::scene::Scene;
 use crate::settings::Limits;
 use crate::sh::{Harmonics, HarmonicsGradients};
-use crate::tiles::{BinScratch, TileGrid};
+use crate::tiles::TileGrid;
 use crate::view::{View, ViewGradients};
 
 /// The stages for a scalar.

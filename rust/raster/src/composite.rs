@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
-use crate::dispatch::{self, SimdLevel};
+use crate::dispatch::{self, SPARE_CHANNELS, SimdLevel};
 use crate::kernel::{BLOCK, Lanes, MAX_CHANNELS, MAX_SIDE, TileImage};
 use crate::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::real::Real;
@@ -134,8 +134,7 @@ pub(crate) fn composite<T: Real>(
         })
         .collect();
     let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
-    // The kernel for the last group may have a channel more than is left.
-    let planes = || vec![Lanes::ZERO; (total + 1) * scene.blocks()];
+    let planes = || vec![Lanes::ZERO; (total + SPARE_CHANNELS) * scene.blocks()];
     let saturated = AtomicUsize::new(0);
     strips
         .into_par_iter()
@@ -169,7 +168,7 @@ fn composite_tile<T: Real>(
         if scene.background.is_none() {
             return 0;
         }
-        planes.fill(Lanes::ZERO);
+        planes[..total * blocks].fill(Lanes::ZERO);
         out.transmittance.fill(Lanes::ONE);
     } else {
         let open = scene.open_pixels(out.tile);

@@ -138,6 +138,8 @@ struct Scaled<T> {
     a: T,
     b: T,
     c: T,
+    /// det Σ − det A Aᵀ
+    blur: T,
     det: T,
 }
 
@@ -159,6 +161,7 @@ fn scaled<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Scaled<T> {
     );
     let n = cross(r0, r1);
     let (a0, c0, area) = (dot(r0, r0), dot(r1, r1), dot(n, n));
+    let blur = eps * (a0 + c0) + eps * eps;
     Scaled {
         unit,
         r0,
@@ -169,7 +172,8 @@ fn scaled<T: Real>(r0: Vec3<T>, r1: Vec3<T>, eps: T) -> Scaled<T> {
         a: a0 + eps,
         b: dot(r0, r1),
         c: c0 + eps,
-        det: area + eps * (a0 + c0) + eps * eps,
+        blur,
+        det: area + blur,
     }
 }
 
@@ -221,12 +225,14 @@ pub(crate) fn whiten_vjp<T: Real>(
     if let Some(v_compensation) = v_compensation {
         // compensation = |n| / √det with n = r₀ × r₁
         let v_det = -v_compensation * w.compensation / (two * s.det);
+        // Of n itself, and of det: where the blur is little they nearly cancel, and what is left is the blur's share.
+        // No product of area and det is formed, which is an eighth power.
         let outward = if s.area >= T::TINY {
-            v_compensation / (s.area * s.det).sqrt()
+            v_compensation / s.area.sqrt() / s.det.sqrt() * (s.blur / s.det)
         } else {
             T::ZERO
         };
-        let v_n = three(|i| s.n[i] * (outward + two * v_det));
+        let v_n = three(|i| s.n[i] * outward);
         let (from_r0, from_r1) = (cross(s.r1, v_n), cross(v_n, s.r0));
         for i in 0..3 {
             v_r0[i] += s.unit * (from_r0[i] + two * s.eps * v_det * s.r0[i]);

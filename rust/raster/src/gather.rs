@@ -17,7 +17,7 @@ pub(crate) struct ChunkSlots<'a, T> {
     pub(crate) values: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) absolute: bool,
-    /// Of all chunks: see [`crate::tiles::TileBins::positions`].
+    /// Of all chunks: see [`crate::bins::TileBins::positions`].
     pub(crate) positions: &'a [u32],
     pub(crate) cover: &'a Cover,
     pub(crate) splats: &'a [Splat<T>],

@@ -101,6 +101,7 @@
 mod batch;
 mod batch_vjp;
 mod binned;
+mod bins;
 mod camera;
 mod chunk;
 mod compiled;
@@ -124,6 +125,7 @@ mod scene;
 mod settings;
 mod sh;
 mod sh_basis;
+mod shared;
 mod slabs;
 mod slots;
 mod sort;

@@ -39,6 +39,8 @@ pub trait Real:
     /// Below this transmittance a pixel stops whatever the settings: nothing behind it can be seen in this
     /// precision, and the backward pass recovers transmittances by division, which denormals would spoil.
     const TRANSMITTANCE_FLOOR: Self;
+    /// Whether the degree of the polynomial for powers of two can be chosen.
+    const HAS_EXP_DEGREES: bool;
 
     /// The nearest value of this type.
     fn of(value: f64) -> Self;
@@ -83,13 +85,14 @@ pub trait Real:
 }
 
 macro_rules! real {
-    ($T:ty, $Key:ty, mantissa $mantissa:literal, terms $terms:literal, floor $floor:literal) => {
+    ($T:ty, $Key:ty, mantissa $mantissa:literal, terms $terms:literal, floor $floor:literal, degrees $degrees:literal) => {
         impl Real for $T {
             type Key = $Key;
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
             const TINY: Self = <$T>::MIN_POSITIVE;
             const TRANSMITTANCE_FLOOR: Self = $floor;
+            const HAS_EXP_DEGREES: bool = $degrees;
 
             #[inline(always)]
             fn of(value: f64) -> Self {
@@ -163,8 +166,8 @@ macro_rules! real {
     };
 }
 
-real!(f32, u32, mantissa 23, terms 6, floor 1e-30);
-real!(f64, u64, mantissa 52, terms 13, floor 1e-290);
+real!(f32, u32, mantissa 23, terms 6, floor 1e-30, degrees true);
+real!(f64, u64, mantissa 52, terms 13, floor 1e-290, degrees false);
 
 #[cfg(test)]
 mod tests {

@@ -1,10 +1,11 @@
 //! What all tiles of a view share.
 
+use crate::bins::TileBins;
 use crate::kernel::{BLOCK, Channels, LANES, MAX_BLOCKS, TileTask};
 use crate::project::Splat;
 use crate::real::Real;
 use crate::settings::Limits;
-use crate::tiles::{TileBins, TileGrid};
+use crate::tiles::TileGrid;
 
 /// What all tiles of a view share.
 #[derive(Clone, Copy)]

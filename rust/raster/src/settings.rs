@@ -22,6 +22,9 @@ pub struct RasterSettings {
     pub max_alpha: f64,
     /// A pixel stops before the Gaussian that would bring its transmittance to this or less. 0 never stops.
     pub min_transmittance: f64,
+    /// Degree of the polynomial that stands for powers of two in `f32`: 3, 4 or 5, with relative errors of alpha of
+    /// 1e-4, 3e-6 and 1e-7, the last being those of the type. `f64` has one of degree 12, and only takes 5 here.
+    pub exp_degree: u32,
     /// Scale opacities by what `eps2d` added to the area (Mip-Splatting), so that thin Gaussians do not grow brighter.
     pub antialiased: bool,
 }
@@ -37,6 +40,7 @@ impl Default for RasterSettings {
             alpha_threshold: 1.0 / 255.0,
             max_alpha: 0.999,
             min_transmittance: 1e-4,
+            exp_degree: 5,
             antialiased: false,
         }
     }
@@ -81,6 +85,7 @@ impl RasterSettings {
                 "min_transmittance",
                 "a number in [0, 1)",
             ),
+            (matches!(self.exp_degree, 3..=5), "exp_degree", "3, 4 or 5"),
         ];
         match checks.into_iter().find(|(ok, ..)| !ok) {
             Some((_, name, expected)) => Err(RasterError::BadSetting { name, expected }),
@@ -144,12 +149,19 @@ pub(crate) struct Limits<T> {
     pub(crate) alpha_threshold: T,
     pub(crate) max_alpha: T,
     pub(crate) min_transmittance: T,
+    pub(crate) exp_degree: u32,
     pub(crate) antialiased: bool,
 }
 
 impl<T: Real> Limits<T> {
     pub(crate) fn new(settings: &RasterSettings) -> Result<Self, RasterError> {
         settings.validate()?;
+        if !T::HAS_EXP_DEGREES && settings.exp_degree != RasterSettings::default().exp_degree {
+            return Err(RasterError::BadSetting {
+                name: "exp_degree",
+                expected: "5 with 64-bit floats, which have one degree only",
+            });
+        }
         Ok(Self {
             tile_size: settings.tile_size as usize,
             eps2d: T::of(settings.eps2d),
@@ -159,6 +171,7 @@ impl<T: Real> Limits<T> {
             alpha_threshold: T::of(settings.alpha_threshold),
             max_alpha: T::of(settings.max_alpha),
             min_transmittance: T::of(settings.min_transmittance).greater(T::TRANSMITTANCE_FLOOR),
+            exp_degree: settings.exp_degree,
             antialiased: settings.antialiased,
         })
     }

@@ -4,7 +4,7 @@ use crate::kernel::{ABSOLUTES, LANES, MOMENTS};
 use crate::pool::{Buffers, bytes_of, stale};
 use crate::real::Real;
 
-/// A slot per entry of [`crate::tiles::TileBins::ranks`]: `MOMENTS`, then channels, then `ABSOLUTES` if asked for. Packed:
+/// A slot per entry of [`crate::bins::TileBins::ranks`]: `MOMENTS`, then channels, then `ABSOLUTES` if asked for. Packed:
 /// slots are read in another order than they are written, so what counts is how many fit into the caches.
 #[derive(Debug)]
 pub(crate) struct Slots<T>(Vec<T>);

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use crate::binned::Binned;
+use crate::bins::BinScratch;
 use crate::camera::Camera;
 use crate::composite::Canvas;
 use crate::composite_vjp::{CompositeGradients, Cotangents};
@@ -13,7 +14,7 @@ use crate::project::ScreenInfo;
 use crate::real::Real;
 use crate::renderer::GaussianGrads;
 use crate::settings::{Limits, RasterSettings, RenderMode};
-use crate::tiles::{BinScratch, TileGrid};
+use crate::tiles::TileGrid;
 use crate::view::{View, scene};
 
 /// A view taken through the stages forward and back, each of which can be repeated.

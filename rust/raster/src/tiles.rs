@@ -1,11 +1,7 @@
-//! Which tiles see which splats, front to back.
+//! Tiles, and which of them a Gaussian reaches.
 
-use crate::chunk::CHUNK;
-use crate::error::RasterError;
-use crate::pool::{bytes_of, filled, stale};
-use crate::project::Splat;
+use crate::pool::{bytes_of, filled};
 use crate::real::Real;
-use crate::sort::{SortScratch, radix_sort_with};
 
 /// How an image is cut into square tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -256,7 +252,7 @@ impl Cover {
     }
 
     /// (Gaussian, tile) pairs of the chunk.
-    fn pairs(&self) -> &[u32] {
+    pub(crate) fn pairs(&self) -> &[u32] {
         &self.tiles[..self.end]
     }
 
@@ -266,133 +262,18 @@ impl Cover {
         self.begins[local] < self.begins[local + 1]
     }
 
-    fn tiles_of(&self, local: usize) -> &[u32] {
+    pub(crate) fn tiles_of(&self, local: usize) -> &[u32] {
         &self.tiles[self.begins[local] as usize..self.begins[local + 1] as usize]
     }
 
-    /// Where a Gaussian's own part of [`TileBins::positions`] is.
+    /// Numbers the chunk's pairs from `base` on.
+    pub(crate) fn number(&mut self, base: u32) {
+        self.base = base;
+    }
+
+    /// Where a Gaussian's own part of [`crate::bins::TileBins::positions`] is.
     #[inline(always)]
     pub(crate) fn pairs_of(&self, local: usize) -> std::ops::Range<usize> {
         (self.base + self.begins[local]) as usize..(self.base + self.begins[local + 1]) as usize
-    }
-}
-
-/// For every tile the splats that may reach it, front to back.
-#[derive(Debug, Default)]
-pub(crate) struct TileBins {
-    /// Tile t owns `ranks[offsets[t]..offsets[t + 1]]`.
-    pub(crate) offsets: Vec<u32>,
-    /// Indices of Gaussians.
-    pub(crate) ranks: Vec<u32>,
-    /// Gaussian by Gaussian and tile by tile: where in `ranks` it stands.
-    pub(crate) positions: Vec<u32>,
-}
-
-impl TileBins {
-    pub(crate) fn bytes(&self) -> usize {
-        bytes_of(&self.offsets) + bytes_of(&self.ranks) + bytes_of(&self.positions)
-    }
-}
-
-/// What sorting and binning need besides their results.
-#[derive(Debug)]
-pub(crate) struct BinScratch<T: Real> {
-    order: Vec<(T::Key, u32)>,
-    sort: SortScratch<T::Key>,
-    next: Vec<u32>,
-}
-
-impl<T: Real> Default for BinScratch<T> {
-    fn default() -> Self {
-        Self {
-            order: Vec::new(),
-            sort: SortScratch::default(),
-            next: Vec::new(),
-        }
-    }
-}
-
-impl<T: Real> BinScratch<T> {
-    pub(crate) fn bytes(&self) -> usize {
-        bytes_of(&self.order) + self.sort.bytes() + bytes_of(&self.next)
-    }
-}
-
-/// Puts the Gaussians that reach some tile in order of depth, ties by index.
-fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut BinScratch<T>) {
-    scratch.order.clear();
-    for (chunk, (splats, cover)) in splats.chunks(CHUNK).zip(covers).enumerate() {
-        let first = (chunk * CHUNK) as u32;
-        let reached = splats
-            .iter()
-            .enumerate()
-            .filter(|&(local, _)| cover.reaches(local));
-        scratch
-            .order
-            .extend(reached.map(|(local, splat)| (splat.depth.key(), first + local as u32)));
-    }
-    radix_sort_with(&mut scratch.order, &mut scratch.sort);
-}
-
-/// Numbers the pairs of every chunk.
-fn number_pairs(covers: &mut [Cover]) -> Result<(), RasterError> {
-    let mut total = 0u32;
-    for cover in covers.iter_mut() {
-        cover.base = total;
-        total = u32::try_from(cover.end)
-            .ok()
-            .and_then(|pairs| total.checked_add(pairs))
-            .ok_or(RasterError::TooManyIntersections)?;
-    }
-    Ok(())
-}
-
-/// Counts the pairs of every tile.
-fn count_pairs(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
-    let offsets = filled(offsets, tiles + 1, 0);
-    for &tile in covers.iter().flat_map(Cover::pairs) {
-        offsets[tile as usize + 1] += 1;
-    }
-    let mut sum = 0;
-    for offset in offsets {
-        sum += *offset;
-        *offset = sum;
-    }
-}
-
-/// Sorts splats by depth and lists those of every tile.
-pub(crate) fn bin_tiles<T: Real>(
-    splats: &[Splat<T>],
-    covers: &mut [Cover],
-    tiles: usize,
-    scratch: &mut BinScratch<T>,
-    bins: &mut TileBins,
-) -> Result<(), RasterError> {
-    number_pairs(covers)?;
-    let covers = &*covers;
-    rayon::join(
-        || sort_by_depth(splats, covers, scratch),
-        || count_pairs(covers, tiles, &mut bins.offsets),
-    );
-    fill_bins(covers, scratch, bins);
-    Ok(())
-}
-
-/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_pairs`].
-fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut BinScratch<T>, bins: &mut TileBins) {
-    let pairs = bins.offsets.last().map_or(0, |&end| end as usize);
-    let ranks = stale(&mut bins.ranks, pairs);
-    let positions = stale(&mut bins.positions, pairs);
-    scratch.next.clear();
-    scratch.next.extend_from_slice(&bins.offsets);
-    for &(_, i) in &scratch.order {
-        let (cover, local) = (&covers[i as usize / CHUNK], i as usize % CHUNK);
-        let own = &mut positions[cover.pairs_of(local)];
-        for (position, &tile) in own.iter_mut().zip(cover.tiles_of(local)) {
-            let slot = &mut scratch.next[tile as usize];
-            ranks[*slot as usize] = i;
-            *position = *slot;
-            *slot += 1;
-        }
     }
 }

@@ -43,7 +43,7 @@ proptest! {
     fn the_order_of_gaussians_does_not_matter(seed in any::<u32>(), n in 1usize..80) {
         let scene = Scene::<f32>::random(n, 3, u64::from(seed));
         let mut order: Vec<usize> = (0..n).collect();
-        let mut dice = fuzz::Dice::new(u64::from(seed));
+        let mut dice = fuzz::dice::Dice::new(u64::from(seed));
         for i in (1..n).rev() {
             order.swap(i, dice.below(i + 1));
         }

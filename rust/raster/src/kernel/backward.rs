@@ -52,7 +52,7 @@ struct Rules<V> {
 
 impl<V: Vector, const K: usize> Sums<V, K> {
     #[inline(always)]
-    fn add<const ABSOLUTE: bool>(
+    fn add<const ABSOLUTE: bool, const DEGREE: usize>(
         &mut self,
         entry: &Entry<V::Scalar, K>,
         block: &mut Block<V::Scalar, K>,
@@ -60,7 +60,7 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         rules: &Rules<V>,
     ) {
         let (u, v) = entry.whitened(block.x.get::<V>(lane), block.y.get(lane));
-        let raw = entry.raw_alpha(u, v);
+        let raw = entry.raw_alpha::<V, DEGREE>(u, v);
         let hit = V::both(
             block.end.get::<V>(lane).at_least(V::splat(entry.place)),
             raw.at_least(rules.threshold),
@@ -145,7 +145,7 @@ fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
 /// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`size` values
 /// each: the moments, then all channels, then the absolutes if ABSOLUTE).
 #[inline(always)]
-pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
+pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, const DEGREE: usize>(
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
     slots: &mut [V::Scalar],
@@ -232,7 +232,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool>(
                 let block = rest.trailing_zeros() as usize;
                 rest &= rest - 1;
                 for lane in (0..LANES).step_by(V::LANES) {
-                    sums.add::<ABSOLUTE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
+                    sums.add::<ABSOLUTE, DEGREE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
                 }
             }
             write::<V::Scalar, K, ABSOLUTE>(task, slot, &sums.reduced::<ABSOLUTE>());

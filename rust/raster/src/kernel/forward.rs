@@ -10,7 +10,7 @@ const BATCH: usize = 2 * WORD;
 
 /// What forward leaves of a tile; pixels in block order. What is in it before does not matter.
 pub(crate) struct TileImage<'a, T> {
-    /// For each of the kernel's channels, which may be one more than are handled now, a plane of blocks.
+    /// For each of the kernel's channels, which may be more than are handled now, a plane of blocks.
     pub(crate) colors: &'a mut [Lanes<T>],
     /// Transmittance behind everything.
     pub(crate) transmittance: &'a mut [Lanes<T>],
@@ -43,9 +43,9 @@ struct Rules<V> {
 
 impl<V: Vector, const K: usize> Light<V, K> {
     #[inline(always)]
-    fn pass(&mut self, entry: &Entry<V::Scalar, K>, x: V, y: V, rules: &Rules<V>) {
+    fn pass<const DEGREE: usize>(&mut self, entry: &Entry<V::Scalar, K>, x: V, y: V, rules: &Rules<V>) {
         let (u, v) = entry.whitened(x, y);
-        let raw = entry.raw_alpha(u, v);
+        let raw = entry.raw_alpha::<V, DEGREE>(u, v);
         let hit = raw.at_least(rules.threshold);
         let alpha = raw.min(rules.max_alpha).keep(hit);
         let next = alpha.times_from(self.unstopped, self.unstopped);
@@ -62,7 +62,7 @@ impl<V: Vector, const K: usize> Light<V, K> {
 
 /// Composites one tile. `open` says which pixels of each block are to be rendered.
 #[inline(always)]
-pub(crate) fn forward_tile<V: Vector, const K: usize>(
+pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
     task: &TileTask<'_, V::Scalar>,
     open: &[u16; MAX_BLOCKS],
     out: TileImage<'_, V::Scalar>,
@@ -125,7 +125,7 @@ pub(crate) fn forward_tile<V: Vector, const K: usize>(
                     while word != 0 {
                         let i = word.trailing_zeros() as usize;
                         word &= word - 1;
-                        light.pass(&entries[w * WORD + i], x, y, &rules);
+                        light.pass::<DEGREE>(&entries[w * WORD + i], x, y, &rules);
                     }
                     if V::bits(light.unstopped.above(rules.stop)) == 0 {
                         break;

@@ -2,10 +2,11 @@
 
 use super::{Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask};
 use crate::real::Real;
-use crate::vector::Vector;
+use crate::vector::{FINEST, Vector};
 
 /// For every pixel the [`Real::ordinal`] of the last splat that more than half the light reaches; 0 where there is
-/// none. Takes what [`super::forward_tile`] left of the tile, and composites as it does.
+/// none. Takes what [`super::forward_tile`] left of the tile, and composites as it does
+/// with the finest exponential.
 #[inline(always)]
 pub(crate) fn median_tile<V: Vector>(
     task: &TileTask<'_, V::Scalar>,
@@ -34,7 +35,7 @@ pub(crate) fn median_tile<V: Vector>(
             let mut dark = true;
             for lane in (0..LANES).step_by(V::LANES) {
                 let (u, v) = entry.whitened(centres.x[block].get::<V>(lane), centres.y[block].get(lane));
-                let raw = entry.raw_alpha(u, v);
+                let raw = entry.raw_alpha::<V, FINEST>(u, v);
                 let hit = V::both(end[block].get::<V>(lane).at_least(place), raw.at_least(threshold));
                 let before = transmittance[block].get::<V>(lane);
                 let counts = V::both(hit, before.above(half));

@@ -229,9 +229,9 @@ impl<T: Real, const K: usize> Entry<T, K> {
 
     /// Alpha before it is limited: opacity · 2^−(u² + v²).
     #[inline(always)]
-    fn raw_alpha<V: Vector<Scalar = T>>(&self, u: V, v: V) -> V {
+    fn raw_alpha<V: Vector<Scalar = T>, const DEGREE: usize>(&self, u: V, v: V) -> V {
         let v2 = v.times_minus(v, V::splat(self.log_opacity));
-        u.minus_times_minus(u, v2).exp2()
+        u.minus_times_minus(u, v2).exp2::<DEGREE>()
     }
 }
 

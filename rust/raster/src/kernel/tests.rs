@@ -4,6 +4,7 @@ use super::*;
 use crate::dispatch::{self, SimdLevel};
 use crate::settings::RasterSettings;
 use crate::slots::slot_size;
+use crate::vector::FINEST;
 use crate::vector::portable::Array;
 
 const SPLATS: usize = 150;
@@ -39,6 +40,10 @@ struct Outcome {
 
 /// Composites 150 splats, half of them faint, into one tile of 4·side pixels and follows a gradient back.
 fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
+    run_with::<T>(runner, channels, side, &RasterSettings::default())
+}
+
+fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings: &RasterSettings) -> Outcome {
     let mut state = 12345u64;
     let mut uniform = || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
@@ -62,7 +67,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         .collect();
     let colors: Vec<T> = (0..SPLATS * channels).map(|_| T::of(uniform())).collect();
     let all: Vec<u32> = (0..SPLATS as u32).collect();
-    let limits = Limits::new(&RasterSettings::default()).unwrap();
+    let limits = Limits::new(settings).unwrap();
     let mut task = TileTask {
         origin: (64, 32),
         side,
@@ -97,7 +102,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         };
         match runner {
             Runner::Level(level) => dispatch::forward(level, &task, &open, out),
-            Runner::Portable => forward_tile::<T::Vector, MAX_CHANNELS>(&task, &open, out),
+            Runner::Portable => forward_tile::<T::Vector, MAX_CHANNELS, FINEST>(&task, &open, out),
         }
         let mut plane = |_| std::array::from_fn(|_| Lanes(std::array::from_fn(|_| T::of(uniform() - 0.5))));
         let v_values = std::array::from_fn(&mut plane);
@@ -116,7 +121,7 @@ fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
         match runner {
             Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, size, false),
             Runner::Portable => {
-                backward_tile::<T::Vector, MAX_CHANNELS, false>(&task, &cotangents, &mut slots, size);
+                backward_tile::<T::Vector, MAX_CHANNELS, false, FINEST>(&task, &cotangents, &mut slots, size);
             }
         }
         task.first += MAX_CHANNELS;
@@ -174,5 +179,38 @@ fn channels_beyond_a_group_add_to_the_moments() {
         let single = run::<f32>(runner, 11, 4);
         assert!(relative(&single.image, &exact.image) < 1e-6);
         assert!(relative(&single.slots, &exact.slots) < 5e-6, "{runner:?}");
+    }
+}
+
+#[test]
+fn rough_exponentials_are_as_rough_as_their_degree() {
+    for level in SimdLevel::available() {
+        for channels in [1, 3, 5] {
+            let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), channels, 4);
+            let errors = [3, 4, 5].map(|exp_degree| {
+                let settings = RasterSettings {
+                    exp_degree,
+                    ..RasterSettings::default()
+                };
+                let rough = run_with::<f32>(Runner::Level(level), channels, 4, &settings);
+                [
+                    relative(&rough.image, &exact.image),
+                    relative(&rough.slots, &exact.slots),
+                ]
+            });
+            for (error, limits) in errors.as_flattened().iter().zip([
+                1e-5..2e-4,
+                1e-5..1e-3,
+                3e-7..6e-6,
+                3e-7..3e-5,
+                0.0..1e-6,
+                0.0..5e-6,
+            ]) {
+                assert!(
+                    limits.contains(error),
+                    "{level:?}, {channels} channels: {errors:?}"
+                );
+            }
+        }
     }
 }

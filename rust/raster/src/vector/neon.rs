@@ -3,7 +3,7 @@
 
 use std::arch::aarch64::*;
 
-use super::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, polynomial};
+use super::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 /// Calls an intrinsic that touches no memory.
 macro_rules! op {
@@ -16,7 +16,7 @@ macro_rules! op {
 macro_rules! neon {
     ($Name:ident, $V:ty, $T:ty, $Mask:ty, $lanes:literal, $dup:ident, $ld:ident, $st:ident, $add:ident, $sub:ident, $mul:ident,
      $div:ident, $fma:ident, $fms:ident, $neg:ident, $min:ident, $max:ident, $ge:ident, $gt:ident, $and:ident, $bsl:ident,
-     $sum:ident, $coefficients:ident, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident,
+     $sum:ident, $coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident,
      $from_int:ident, $shift:ident, $add_int:ident) => {
         #[derive(Clone, Copy)]
         #[allow(unreachable_pub)]
@@ -84,12 +84,12 @@ macro_rules! neon {
                 Self(op!($max(self.0, other.0)))
             }
             #[inline(always)]
-            fn exp2(self) -> Self {
+            fn exp2<const DEGREE: usize>(self) -> Self {
                 // Adding 1.5 · 2^mantissa rounds to an integer and leaves it in the low bits.
                 let magic = Self::splat($magic);
                 let clipped = self.max(Self::splat($lowest));
                 let shifted = clipped.plus(magic);
-                let power = polynomial(clipped.minus(shifted.minus(magic)), &$coefficients);
+                let power = polynomial(clipped.minus(shifted.minus(magic)), $coefficients);
                 Self(op!($from_int($add_int(
                     $to_int(power.0),
                     $shift::<$mantissa>($to_int(shifted.0))
@@ -160,7 +160,7 @@ neon!(
     vandq_u32,
     vbslq_f32,
     vaddvq_f32,
-    EXP2_F32,
+    exp2_f32::<DEGREE>(&EXP2_F32),
     -126.0,
     12_582_912.0,
     23,
@@ -192,7 +192,7 @@ neon!(
     vandq_u64,
     vbslq_f64,
     vaddvq_f64,
-    EXP2_F64,
+    &EXP2_F64,
     -1022.0,
     6_755_399_441_055_744.0,
     52,

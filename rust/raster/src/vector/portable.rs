@@ -1,13 +1,13 @@
 //! Arrays of four floats, for targets without a vector type of their own, and for tests of the others.
 
-use super::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, polynomial};
+use super::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 #[derive(Clone, Copy)]
 #[allow(unreachable_pub)]
 pub struct Array<T>([T; 4]);
 
 macro_rules! array {
-    ($T:ty, $Bits:ty, $coefficients:ident, $lowest:literal, $magic:literal, $mantissa:literal) => {
+    ($T:ty, $Bits:ty, $coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal) => {
         impl Array<$T> {
             #[inline(always)]
             fn map2(self, other: Self, f: impl Fn($T, $T) -> $T) -> Self {
@@ -73,12 +73,12 @@ macro_rules! array {
                 self.map2(other, |a, b| if a > b { a } else { b })
             }
             #[inline(always)]
-            fn exp2(self) -> Self {
+            fn exp2<const DEGREE: usize>(self) -> Self {
                 // Adding 1.5 · 2^mantissa rounds to an integer and leaves it in the low bits.
                 let magic = Self::splat($magic);
                 let clipped = self.max(Self::splat($lowest));
                 let shifted = clipped.plus(magic);
-                let power = polynomial(clipped.minus(shifted.minus(magic)), &$coefficients);
+                let power = polynomial(clipped.minus(shifted.minus(magic)), $coefficients);
                 power.map2(shifted, |p, s| {
                     <$T>::from_bits(p.to_bits().wrapping_add(s.to_bits() << $mantissa))
                 })
@@ -118,5 +118,5 @@ macro_rules! array {
         }
     };
 }
-array!(f32, u32, EXP2_F32, -126.0, 12_582_912.0, 23);
-array!(f64, u64, EXP2_F64, -1022.0, 6_755_399_441_055_744.0, 52);
+array!(f32, u32, exp2_f32::<DEGREE>(&EXP2_F32), -126.0, 12_582_912.0, 23);
+array!(f64, u64, &EXP2_F64, -1022.0, 6_755_399_441_055_744.0, 52);

@@ -4,7 +4,7 @@ use std::arch::x86_64::*;
 
 use super::nth;
 use super::sse::F32x4;
-use crate::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, polynomial};
+use crate::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 /// Comparisons of 256-bit vectors: a mask is a vector of all-ones and zeros.
 macro_rules! masks256 {
@@ -62,7 +62,7 @@ impl Vector for F32x8 {
         _mm256_fnmsub_ps
     );
     exp2_by_bits!(
-        EXP2_F32,
+        exp2_f32::<DEGREE>(&EXP2_F32),
         -126.0,
         12_582_912.0,
         23,
@@ -129,7 +129,7 @@ impl Vector for F64x4 {
         _mm256_fnmsub_pd
     );
     exp2_by_bits!(
-        EXP2_F64,
+        &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,
         52,

@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use crate::vector::{EXP2_F32_FLOOR, EXP2_F64, MAX_SUMS, Vector, polynomial};
+use crate::vector::{EXP2_F32_FLOOR, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 /// Comparisons of 512-bit vectors: a mask is a mask register.
 macro_rules! masks512 {
@@ -118,10 +118,10 @@ impl Vector for F32x16 {
         _mm512_maskz_mov_ps
     );
     #[inline(always)]
-    fn exp2(self) -> Self {
+    fn exp2<const DEGREE: usize>(self) -> Self {
         // Two instructions, the fractional part and the scaling by 2^floor, stand for the five of the bit trick.
         let fraction = Self(op!(_mm512_reduce_ps::<{ _MM_FROUND_TO_NEG_INF }>(self.0)));
-        let power = polynomial(fraction, &EXP2_F32_FLOOR);
+        let power = polynomial(fraction, exp2_f32::<DEGREE>(&EXP2_F32_FLOOR));
         Self(op!(_mm512_scalef_ps(power.0, self.0)))
     }
     #[inline(always)]
@@ -181,7 +181,7 @@ impl Vector for F64x8 {
         _mm512_maskz_mov_pd
     );
     exp2_by_bits!(
-        EXP2_F64,
+        &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,
         52,

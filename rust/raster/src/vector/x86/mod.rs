@@ -112,14 +112,14 @@ macro_rules! separate {
 
 /// 2^x by rounding to the nearest integer, which adding 1.5 · 2^mantissa does and leaves in the low bits.
 macro_rules! exp2_by_bits {
-    ($coefficients:ident, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident, $from_int:ident, $shift:ident, $add:ident) => {
+    ($coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident, $from_int:ident, $shift:ident, $add:ident) => {
         #[inline(always)]
-        fn exp2(self) -> Self {
+        fn exp2<const DEGREE: usize>(self) -> Self {
             let magic = Self::splat($magic);
             let clipped = self.max(Self::splat($lowest));
             let shifted = clipped.plus(magic);
             let fraction = clipped.minus(shifted.minus(magic));
-            let power = polynomial(fraction, &$coefficients);
+            let power = polynomial(fraction, $coefficients);
             Self(op!($from_int($add(
                 $to_int(power.0),
                 $shift::<$mantissa>($to_int(shifted.0))

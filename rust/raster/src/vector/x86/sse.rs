@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 
 use super::nth;
-use crate::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, polynomial};
+use crate::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 #[derive(Clone, Copy)]
 #[allow(unreachable_pub)]
@@ -26,7 +26,7 @@ impl Vector for F32x4 {
     divided!(_mm_div_ps);
     separate!();
     exp2_by_bits!(
-        EXP2_F32,
+        exp2_f32::<DEGREE>(&EXP2_F32),
         -126.0,
         12_582_912.0,
         23,
@@ -104,7 +104,7 @@ impl Vector for F64x2 {
     divided!(_mm_div_pd);
     separate!();
     exp2_by_bits!(
-        EXP2_F64,
+        &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,
         52,
