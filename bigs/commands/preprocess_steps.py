@@ -48,6 +48,7 @@ from bigs.preprocess.landmarker import find_keypoints
 from bigs.preprocess.mask_checks import check_masks
 from bigs.preprocess.masks import MaskSource, open_masks, write_masks
 from bigs.preprocess.sam2 import load_sam2, no_weights, segment_clip
+from bigs.preprocess.silhouette_points import SilhouettePointsConfig, complete_points
 from bigs.preprocess.source import open_source
 from bigs.preprocess.words import frame_ranges
 from bigs.types import Side
@@ -191,29 +192,36 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     count = len(frames.names)
     stamp, picture = processed / BUILD_FILE, processed / "build.png"
     parts = [processed / name for name in (FRAMES_FILE, MASKS, HANDS_FILE, SFM_FILE, ALIGNED_FILE)]
-    inputs = content_digest(*parts, frames.K, _model_identity(request))
+    config = SilhouettePointsConfig()
+    inputs = content_digest(*parts, frames.K, _model_identity(request), asdict(config))
     ours = stamp.exists()
     if request.state(stamp, inputs) == "current" and (request.clip / "build" / "data.npy").is_file():
         return kept("build", "current", str(request.clip / "build"), picture)
     models = load_hand_models(request.hand_model)
-    images, masks = frame_paths(processed, frames), mask_paths(processed, frames)
+    paths = frame_paths(processed, frames)
+    masks = np.stack([read_mask(path) for path in mask_paths(processed, frames)])
+    sfm = read_object_sfm(processed / SFM_FILE, count)
+    alignment = read_alignment(processed / ALIGNED_FILE, count)
+    listen("points where silhouettes tell the surface")
+    completed = complete_points(sfm, alignment, lambda t: read_image(paths[t]), masks, frames.K, config)
     build = write_build(
         request.clip,
         name=request.clip.resolve().name,
         frame_names=frames.names,
-        images=(read_image(path) for path in images),
-        masks=(read_mask(path) for path in masks),
+        images=(read_image(path) for path in paths),
+        masks=masks,
         K=frames.K,
         hands=read_hands(processed / HANDS_FILE, count),
         hand_models=models,
-        sfm=read_object_sfm(processed / SFM_FILE, count),
-        alignment=read_alignment(processed / ALIGNED_FILE, count),
+        sfm=completed,
+        alignment=alignment,
         ours=ours,
     )
     clip = load_hold(build)
     write_json(stamp, {"build": str(build)}, inputs)
-    write_sheet(picture, images, frames.names, draw_clip(clip, models))
-    return StepOutcome("build", "made", str(build), (), picture)
+    write_sheet(picture, paths, frames.names, draw_clip(clip, models))
+    summary = f"{build}, {len(completed.points)} points of the object ({len(sfm.points)} from its motion)"
+    return StepOutcome("build", "made", summary, (), picture)
 
 
 def _supplied_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:

@@ -60,14 +60,26 @@ def times_seen(
     """
     count = np.zeros(len(points), dtype=int)
     for t in range(len(views.shown)):
-        row, column, depth, inside = views.pixels(t, points)
-        cosine = (views.directions(t, points) * normals).sum(-1)
-        facing = cosine > _LEAST_COSINE
-        # The buffer holds the nearest of some pixels around: on a slope that is nearer than the point's own.
-        slope = np.sqrt(1.0 - cosine.clip(_LEAST_COSINE, 1.0) ** 2) / cosine.clip(_LEAST_COSINE, 1.0)
-        nearest = views.nearest_depths(t, surface)[row, column] + _CLOSED * depth / views.K[0, 0] * slope
-        count += inside & facing & views.shown[t, row, column] & (depth < nearest + tolerance)
+        count += seen_in(views, t, points, normals, surface, tolerance)
     return count
+
+
+def seen_in(
+    views: ObjectViews,
+    t: int,
+    points: np.ndarray,
+    normals: np.ndarray,
+    surface: np.ndarray,
+    tolerance: float,
+) -> np.ndarray:
+    """Which surface points [N] (bool) show in frame `t`; arguments as for `times_seen`."""
+    row, column, depth, inside = views.pixels(t, points)
+    cosine = (views.directions(t, points) * normals).sum(-1)
+    facing = cosine > _LEAST_COSINE
+    # The buffer holds the nearest of some pixels around: on a slope that is nearer than the point's own.
+    slope = np.sqrt(1.0 - cosine.clip(_LEAST_COSINE, 1.0) ** 2) / cosine.clip(_LEAST_COSINE, 1.0)
+    nearest = views.nearest_depths(t, surface)[row, column] + _CLOSED * depth / views.K[0, 0] * slope
+    return inside & facing & views.shown[t, row, column] & (depth < nearest + tolerance)
 
 
 def times_empty(views: ObjectViews, points: np.ndarray, surface: np.ndarray, tolerance: float) -> np.ndarray:

@@ -176,12 +176,17 @@ def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12)
     return normals * np.where((normals * outward).sum(-1, keepdims=True) < 0, -1.0, 1.0)
 
 
+def neighbour_distances(points: np.ndarray, neighbours: int = 6) -> np.ndarray:
+    """Mean distance [N] of each point to its nearest `neighbours`, of which there must be as many."""
+    distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours + 1)
+    return distance[:, 1:].mean(axis=1)
+
+
 def inlier_points(points: np.ndarray, neighbours: int = 6, factor: float = 3.0) -> np.ndarray:
     """Which points [N] (bool) have neighbours as near as the others do; the rest are stray."""
     if len(points) <= neighbours:
         return np.ones(len(points), dtype=bool)
-    distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours + 1)
-    mean = distance[:, 1:].mean(axis=1)
+    mean = neighbour_distances(points, neighbours)
     return mean < factor * np.median(mean)
 
 

@@ -18,11 +18,11 @@ import scipy.ndimage
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.touching import masks_touch
-from bigs.geometry.surface import DistanceGrid
+from bigs.geometry.surface import DistanceGrid, inlier_points
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
 from bigs.preprocess.hands import posed_track
-from bigs.preprocess.object_surface import SurfaceConfig, rough_surface
+from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
 from bigs.types import Side
 
 
@@ -97,13 +97,16 @@ def align(
         raise InputError("alignment: expected at least one hand, whose size tells the object's, found none")
     verts = {side: posed_vertices(track, hand_models[side]) for side, track in hands.items()}
     touching = {
-        side: touching_frames(masks, side, config.touch_pixels) & hands[side].valid & (sfm.confidence > 0)
-        for side in hands
+        side: np.array([masks_touch(labels, side, config.touch_pixels) for labels in masks])
+        & track.valid
+        & (sfm.confidence > 0)
+        for side, track in hands.items()
     }
     guess = first_scale(verts, touching, hands, sfm)
-    grid = rough_surface(
-        guess * sfm.points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface
-    )
+    points = guess * sfm.points
+    points = points[inlier_points(points)]
+    hull = visual_hull(points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface)
+    grid = rough_surface(points, hull, config.surface)
     factors = np.exp(np.linspace(-config.span, config.span, config.sizes))
     frames = sum(int(t.sum()) for t in touching.values())
     if frames == 0:
@@ -159,11 +162,6 @@ def _alignment(scale: float, sfm: ObjectSfm, hand_transl: dict[Side, np.ndarray]
 def posed_vertices(track: HandTrack, model: HandModel) -> np.ndarray:
     """Vertices [T, V, 3] of a track in the camera frame, metres."""
     return posed_track(track, model).vertices.double().numpy()
-
-
-def touching_frames(masks: np.ndarray, side: Side, reach: int) -> np.ndarray:
-    """Frames [T] (bool) in which the masks of a hand and of the object come within `reach` pixels."""
-    return np.array([masks_touch(labels, side, reach) for labels in masks])
 
 
 def first_scale(

@@ -12,7 +12,6 @@ from bigs.geometry.surface import (
     blend_with_points,
     convex_distance,
     empty_grid,
-    inlier_points,
     point_normals,
     silhouette_around_points,
 )
@@ -29,7 +28,7 @@ class SurfaceConfig:
     margin: float = 0.01  # how far the surface may leave the points' convex hull
 
 
-def rough_surface(
+def visual_hull(
     points: np.ndarray,
     rotations: np.ndarray,
     transl: np.ndarray,
@@ -37,30 +36,33 @@ def rough_surface(
     masks: np.ndarray,
     K: np.ndarray,
     config: SurfaceConfig,
-) -> DistanceGrid:
-    """The visual hull blended with the points' planes, cut back to near their convex hull.
+) -> VisualHull:
+    """The silhouettes that carve, of frames spread over the clip.
 
     Args:
-        points: [N, 3] metres, object frame.
+        points: [N, 3] metres, object frame, without strays.
         rotations, transl: [T, 3, 3] and [T, 3], object to camera.
         confidence: [T]; frames that have none do not carve.
         masks: [T, H, W] labels; whatever is not background may hide the object.
         K: [3, 3].
         config: see there.
     """
-    points = points[inlier_points(points)]
-    size = float((points.max(0) - points.min(0)).max())
-    grid = empty_grid(points.min(0) - 0.15 * size, points.max(0) + 0.15 * size, config.resolution)
-    corners = grid.points()
-    bound = convex_distance(corners, points) - config.margin
     usable = np.flatnonzero(confidence > 0) if (confidence > 0).any() else np.arange(len(masks))
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, config.frames).round().astype(int))]
     silhouettes = [
         silhouette_around_points(masks[t] != 0, points @ rotations[t].T + transl[t], K) for t in chosen
     ]
-    hull = VisualHull(
+    return VisualHull(
         np.stack(silhouettes), K, rotations[chosen], transl[chosen], min(config.agreeing, len(chosen))
     )
+
+
+def rough_surface(points: np.ndarray, hull: VisualHull, config: SurfaceConfig) -> DistanceGrid:
+    """The visual hull blended with the planes of points [N, 3], cut back to near their convex hull."""
+    size = float((points.max(0) - points.min(0)).max())
+    grid = empty_grid(points.min(0) - 0.15 * size, points.max(0) + 0.15 * size, config.resolution)
+    corners = grid.points()
+    bound = convex_distance(corners, points) - config.margin
     distance = np.maximum(hull.distance(corners, stop=config.reach), bound)
     carved = DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
     normals = point_normals(points, hull.outward(points, 0.5 * grid.spacing))

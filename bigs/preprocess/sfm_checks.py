@@ -18,7 +18,7 @@ from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_features import FrameFeatures
 from bigs.preprocess.sfm_models import PartialModel
 from bigs.preprocess.sfm_refine import disagreement
-from bigs.preprocess.sfm_seed import mirror_misfits
+from bigs.preprocess.sfm_seed import mirror_misfits, mirrored
 from bigs.preprocess.tracks import Tracks
 
 
@@ -94,7 +94,11 @@ def check_map(
     otherwise = np.zeros(frames, dtype=bool)
     for model in models:
         rows, degrees = disagreement(map_.rotations, model)
-        otherwise[model.frames[rows[degrees > config.most_disagreement]]] = True
+        # A model that is the map's mirror image in depth is one more start that came out reversed: which of
+        # the two is right, perspective tells.
+        image = model._replace(rotations=mirrored(model.rotations))
+        if disagreement(map_.rotations, image)[1].max(initial=0.0) > config.most_disagreement:
+            otherwise[model.frames[rows[degrees > config.most_disagreement]]] = True
     signs = {
         FEW: sightings < config.least_sightings,
         LOOSE: uncertainty > config.most_uncertain,

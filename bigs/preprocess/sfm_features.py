@@ -48,9 +48,9 @@ class _Crop(NamedTuple):
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Let COLMAP log nothing below an error, for as long as the block lasts."""
+    """Let COLMAP log nothing that does not end it, for as long as the block lasts: failures are told here."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
         yield
     finally:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -56,11 +57,16 @@ def refine(
     """
     misfit = np.inf
     for _ in range(config.passes):
-        poses = [(map_.rotations, map_.transl), *spliced_poses(map_, models, start, config)]
-        tried = [_made_anew(map_, tracks, *pose) for pose in poses]
-        misfits = [anew.misfit() for anew in tried]
-        misfit = min(misfits)
-        map_ = tried[misfits.index(misfit)]
+        best = _made_anew(map_, tracks, map_.rotations, map_.transl)
+        misfit = best.misfit()
+        for model, rotations, transl in splices(map_, models, start, config):
+            anew = _made_anew(map_, tracks, rotations, transl)
+            # A model that turns otherwise even from where the map takes it up was wrong itself, and what
+            # came of it is no better than chance.
+            agrees = disagreement(anew.rotations, model)[1].max(initial=0.0) <= config.disagreement
+            if agrees and anew.misfit() < misfit:
+                best, misfit = anew, anew.misfit()
+        map_ = best
         polish(map_, config.rounds)
     return map_, misfit
 
@@ -104,10 +110,18 @@ def _made_anew(map_: ObjectMap, tracks: Tracks, rotations: np.ndarray, transl: n
     return anew
 
 
-def spliced_poses(
+class Splice(NamedTuple):
+    """Poses of all frames, with those of a partial model in place of the map's."""
+
+    model: PartialModel
+    rotations: np.ndarray  # [T, 3, 3]
+    transl: np.ndarray  # [T, 3]
+
+
+def splices(
     map_: ObjectMap, models: Sequence[PartialModel], start: np.ndarray, config: RefineConfig
-) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-    """Poses [T, 3, 3] and [T, 3] of all frames, with those of a model that disagrees in place of the map's.
+) -> Iterable[Splice]:
+    """What comes of putting each model that disagrees with the map in its place.
 
     Arguments as for `refine`; nothing where all models agree.
     """
@@ -120,7 +134,7 @@ def spliced_poses(
         order = rows[np.argsort(away, kind="stable")]
         for depth in config.depths:
             if depth < len(order):
-                yield _joined(map_, model, order[depth:])
+                yield Splice(model, *_joined(map_, model, order[depth:]))
 
 
 def _joined(map_: ObjectMap, model: PartialModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -31,6 +31,11 @@ class Seed(NamedTuple):
     mirror_misfit: float  # the same of their mirror image
 
 
+def mirrored(rotations: np.ndarray) -> np.ndarray:
+    """The rotations [F, 3, 3] of the mirror image in depth."""
+    return _FLIP @ rotations @ _FLIP
+
+
 def find_seed(map_: ObjectMap, model: PartialModel) -> Seed | None:
     """The longest smooth run of `model`, adjusted, in the better mirror image; None if it has none.
 
@@ -42,8 +47,8 @@ def find_seed(map_: ObjectMap, model: PartialModel) -> Seed | None:
     middle = np.median(model.points, axis=0)
     transl = model.transl + model.rotations @ middle
     tried = []
-    for flip in (np.eye(3), _FLIP):
-        map_.restart(model.frames[run], flip @ model.rotations[run] @ flip, transl[run])
+    for rotations in (model.rotations[run], mirrored(model.rotations[run])):
+        map_.restart(model.frames[run], rotations, transl[run])
         map_.settle()
         frames = model.frames[run]
         tried.append((map_.misfit(), map_.rotations[frames].copy(), map_.transl[frames].copy()))
@@ -77,8 +82,8 @@ def mirror_misfits(map_: ObjectMap, frames: np.ndarray) -> tuple[float, float]:
     """
     rotations, transl = map_.rotations[frames].copy(), map_.transl[frames].copy()
     misfits = []
-    for flip in (np.eye(3), _FLIP):
-        map_.restart(frames, flip @ rotations @ flip, transl)
+    for turned in (rotations, mirrored(rotations)):
+        map_.restart(frames, turned, transl)
         map_.settle()
         misfits.append(map_.misfit())
     return misfits[0], misfits[1]

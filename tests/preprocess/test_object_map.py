@@ -19,7 +19,7 @@ from bigs.preprocess.sfm_checks import (
     turn_cosines,
 )
 from bigs.preprocess.sfm_grow import GrowConfig, grow
-from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, spliced_poses
+from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, splices
 from bigs.preprocess.sfm_seed import find_seed, smooth_run
 from bigs.preprocess.tracks import join_matches
 
@@ -157,6 +157,13 @@ def test_a_partial_model_that_turns_otherwise_is_told() -> None:
     assert not disagreement(egg.rotations, model._replace(points=model.points[:20]))[1].size
 
 
+def test_a_partial_model_that_is_the_mirror_image_says_nothing_against_the_map(egg: TurningObject) -> None:
+    model = egg.model(range(22, 40), mirrored=True)
+    assert disagreement(egg.rotations, model)[1].max() > 20.0
+    checks = check_map(at_truth(egg), egg.features, egg.tracks(), (model,), CheckConfig())
+    assert not any(checks.flags)
+
+
 def test_a_bent_map_is_made_anew(egg: TurningObject) -> None:
     """Forgetting early mistakes is enough where frames see each other's points."""
     found = egg.map()
@@ -173,17 +180,31 @@ def test_a_partial_model_takes_the_place_of_a_bent_part(egg: TurningObject) -> N
     rotations = Rotation.from_rotvec(turns[:, None] * (0.2, 0.9, 0.1)).as_matrix() @ egg.rotations
     found.restart(np.arange(40), rotations, egg.transl)
     models = (egg.model(range(0, 15)), egg.model(range(19, 40)))
-    offered = list(spliced_poses(found, models, np.arange(15), RefineConfig()))
+    offered = list(splices(found, models, np.arange(15), RefineConfig()))
     assert len(offered) == len(RefineConfig().depths)
     assert rotation_errors(rotations, egg.rotations).max() > 20.0
-    assert rotation_errors(offered[0][0], egg.rotations).max() < 1.0
+    assert rotation_errors(offered[0].rotations, egg.rotations).max() < 1.0
     misfits = []
-    for pose in ((rotations, egg.transl), offered[0]):
+    for pose in ((rotations, egg.transl), offered[0][1:]):
         found.restart(np.arange(40), *pose)
         found.settle()
         misfits.append(found.misfit())
     assert misfits[1] <= misfits[0]
-    assert not list(spliced_poses(at_truth(egg), models, np.arange(15), RefineConfig()))
+    assert not list(splices(at_truth(egg), models, np.arange(15), RefineConfig()))
+
+
+def test_a_partial_model_that_is_wrong_itself_takes_no_place(
+    egg: TurningObject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It happened to fit a third of a percent better in a clip whose second model was reversed in depth."""
+    models = (egg.model(range(0, 15)), egg.model(range(22, 40), mirrored=True))
+    found = at_truth(egg)
+    assert list(splices(found, models, np.arange(15), RefineConfig()))
+    monkeypatch.setattr(
+        ObjectMap, "misfit", lambda self: -rotation_errors(self.rotations, egg.rotations).max()
+    )
+    better, _ = refine(found, egg.tracks(), models, np.arange(15), RefineConfig())
+    assert rotation_errors(better.rotations, egg.rotations).max() < 0.6
 
 
 def test_a_turn_that_goes_back_is_a_warning_and_no_more() -> None:
