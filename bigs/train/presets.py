@@ -243,7 +243,7 @@ FULL = replace(
         replace(_REGRASP, steps=200),
         SplitStage(),
         replace(_JOINT, steps=300),
-        replace(_DETAIL, steps=800, image_size=640),
+        replace(_DETAIL, steps=1000, image_size=640),
         CompletionStage(),
         GuidanceStage(steps=600),
     ),
