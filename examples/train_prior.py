@@ -110,7 +110,7 @@ def completed(file: Path, denoiser: Denoiser, steps: int) -> Found:
         GuidanceStage(steps=steps),
         RasterSettings(),
         # There are no pictures of a clip here, so no guard over what they show.
-        lambda: 1.0,
+        lambda: torch.ones(1),
     )
     moved = follow(as_tensor(flat.verts), half.means, done.moved).numpy()
     return Found(file.stem, unseen_score(flat.verts, truth), unseen_score(moved, truth))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +39,7 @@ from bigs.train.presets import PRESETS
         "ablate",
         "prior",
         "prior fit",
+        "prior train",
         "bench",
         "bench engine",
         "bench preprocess",
@@ -69,6 +72,7 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "info": "HANDS-challenge build folder",
         "prior": "sides that a clip never shows",
         "prior fit": "textual inversion",
+        "prior train": "folder of meshes",
         "bench": "Measure how fast",
         "ablate": "beside the paper's Table 3",
         "bench engine": "runs of everything",
@@ -77,6 +81,14 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:
         assert word in text
+
+
+def test_a_reader_that_has_enough_is_no_failure_to_tell() -> None:
+    """As in `bigs --help | head -1`."""
+    command = [sys.executable, "-m", "bigs.cli", "reconstruct", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
 
 
 def test_version(call: Callable[..., Answer]) -> None:
@@ -89,6 +101,8 @@ def test_version(call: Callable[..., Answer]) -> None:
         ("reconstruct CLIP --out OUT --bogus 3", ["--bogus"]),
         ("reconstruct CLIP --out OUT --preset turbo", ["turbo", "--preset", "smoke"]),
         ("reconstruct CLIP", ["--out"]),
+        ("reconstruct CLIP --out OUT --preset fast --config plan.yaml", ["--preset fast", "plan.yaml"]),
+        ("ablate CLIP --out OUT --preset fast --config plan.yaml", ["--preset fast", "plan.yaml"]),
         ("reconstruct CLIP --out OUT --without turbo", ["--without", "share", "contact", "ssim", "'turbo'"]),
         ("reconstruct CLIP --out OUT --threads two", ["--threads"]),
         ("reconstruct CLIP --out OUT --threads -1", ["--threads", "expected 0", "found -1"]),

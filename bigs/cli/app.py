@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -71,6 +72,10 @@ def main(arguments: list[str] | None = None) -> None:
         fail(str(error), 2)
     except FloatingPointError as error:
         fail(f"{error}; the last checkpoint is kept", 3)
+    except BrokenPipeError:
+        # Whoever read the output, as `head`, has enough. Python would complain once more as it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         fail(f"{place}expected a file or folder that can be read or written, found: {error.strerror}", 4)

@@ -42,7 +42,7 @@ def batch(
         workers: clips at a time; 0 takes as many as there are cores (processes) or all (slurm, ray).
         threads: CPU threads for each clip; 0 shares this machine's out (processes) or is 2 (slurm, ray).
         retries: further attempts at a clip that fails or whose worker dies, from its last checkpoint.
-        preset: for clips whose entry names none.
+        preset: for clips whose entry names neither a preset nor a config.
         hand_model: for clips whose entry names none.
         set: change one setting for all clips, as path=value; repeatable.
         without: leave out one ingredient for all clips; repeatable.
@@ -66,12 +66,13 @@ def batch(
             raise InputError(f"{name}: expected --engine {owner}, found {engine}")
 
     def config_of(entry: Entry) -> RunConfig:
-        chosen = entry.preset or preset
-        if chosen not in PRESETS:
-            raise InputError(
-                f"{manifest}: {entry.name}: preset: expected one of {', '.join(PRESETS)}, found {chosen!r}"
-            )
-        settings = settings_of(cast(Preset, chosen), entry.config, (*set, *entry.set))
+        where = f"{manifest}: {entry.name}: preset"
+        if entry.preset is not None and entry.preset not in PRESETS:
+            raise InputError(f"{where}: expected one of {', '.join(PRESETS)}, found {entry.preset!r}")
+        if entry.preset is not None and entry.config is not None:
+            raise InputError(f"{where}: expected a preset or a config, found both")
+        own = cast(Preset | None, entry.preset)
+        settings = settings_of(own, entry.config, (*set, *entry.set), default=preset)
         return without_all(settings, (*without, *entry.without))[0]
 
     entries = read_manifest(manifest)

@@ -93,7 +93,7 @@ def info(clip: ClipPath, hand_model: Path | None = None) -> None:
 def reconstruct(
     clip: ClipPath,
     out: Path,
-    preset: Preset = "full",
+    preset: Preset | None = None,
     hand_model: Path | None = None,
     gt: Path | None = None,
     resume: bool = False,
@@ -116,7 +116,8 @@ def reconstruct(
         clip: a HOLD / HANDS-challenge build folder, or the folder that holds it; or a video or a folder of
             images, which preprocessing makes a clip of first, in RUN/clip.
         out: the run folder to make.
-        preset: smoke (seconds), demo, fast (two minutes), full, or paper (the paper's equations and weights).
+        preset: smoke (seconds), demo, fast (minutes), full (if neither this nor a config is given), or paper
+            (the paper's equations and weights).
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
         gt: ground truth to score against, which the reconstruction never sees: gt.npz, an ARCTIC raw sequence
             or an HO-3D clip.
@@ -246,7 +247,7 @@ def view(
 def ablate(
     clip: ClipPath,
     out: Path,
-    preset: Preset = "fast",
+    preset: Preset | None = None,
     rows: tuple[str, ...] | None = None,
     hand_model: Path | None = None,
     gt: Path | None = None,
@@ -259,7 +260,7 @@ def ablate(
     Args:
         clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
         out: folder for one run per row, ablation.md and ablation.json; rows that it holds are not run again.
-        preset: the full method.
+        preset: the full method; fast if neither this nor a config is given.
         rows: what to leave out, each a name of reconstruct --without or several joined by +; the paper's if
             not given.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
@@ -272,7 +273,7 @@ def ablate(
     from bigs.commands.ablate import ablate as run
     from bigs.commands.ablate import default_rows
 
-    settings = settings_of(preset, config, set)
+    settings = settings_of(preset, config, set, default="fast")
     with stderr.status("starting") as status:
         found = run(
             clip,

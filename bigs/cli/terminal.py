@@ -51,11 +51,22 @@ def use_threads(threads: int) -> None:
         torch.set_num_threads(threads)
 
 
-def settings_of(preset: Preset, file: Path | None, changes: tuple[str, ...]) -> RunConfig:
+def settings_of(
+    preset: Preset | None, file: Path | None, changes: tuple[str, ...], default: Preset = "full"
+) -> RunConfig:
+    """The settings of a preset or of a file, with changes; `default` names the preset where neither is given.
+
+    Raises:
+        InputError: both are given, or one is not as it should be.
+    """
+    if preset is not None and file is not None:
+        raise InputError(
+            f"--preset {preset}: expected none beside --config, which is a whole plan, found {file}"
+        )
     from bigs.train.config_file import load_config, with_changes
     from bigs.train.presets import PRESETS
 
-    return with_changes(PRESETS[preset] if file is None else load_config(file), changes)
+    return with_changes(PRESETS[preset or default] if file is None else load_config(file), changes)
 
 
 def print_tables(tables: list[Table], out: Path) -> None:

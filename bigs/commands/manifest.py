@@ -91,8 +91,10 @@ def _rows(path: Path, text: str) -> Sequence[Any]:
 
 
 def _with_defaults(defaults: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row's own values count; lists of settings add up, the row's last."""
-    both = {**defaults, **row}
+    """A row's own values count; lists of settings add up, the row's last. A plan is a preset or a config."""
+    plans = {"preset", "config"}
+    inherited = {key: value for key, value in defaults.items() if key not in plans or not plans & row.keys()}
+    both = {**inherited, **row}
     for key in _LISTS:
         parts = [values[key] for values in (defaults, row) if key in values]
         parts = [part.split(_SEPARATOR) if isinstance(part, str) else part for part in parts]

@@ -23,10 +23,12 @@ from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.guidance.cameras import make_orbit, virtual_cameras
+from bigs.guidance.denoiser import Conditions
 from bigs.guidance.diffusers_folder import Device, choose
-from bigs.guidance.pixel import PIXELS, PixelConfig
+from bigs.guidance.pixel import PIXELS, PixelConfig, PixelDenoiser, PixelNet
 from bigs.guidance.pixel_file import save_pixel_net
 from bigs.guidance.pixel_training import Pictures, PixelTraining, PixelTrainingConfig
+from bigs.guidance.residual import picture_residual
 from bigs.models.lighting import N_PARTS
 from bigs.models.object_splats import CanonicalObject
 from bigs.raster.settings import RasterSettings
@@ -39,6 +41,9 @@ _SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 _GAUSSIANS = 3000
 # Standard deviation of a Gaussian on the mesh, in spacings of its neighbours, and along the normal.
 _SPREAD, _FLATNESS = 0.6, 0.35
+# Of so many meshes, in so many pictures of each, it is looked how well the network knows them; all but this
+# share of them is known so well.
+_ASKED_MESHES, _ASKED_VIEWS, _ASKED_SHARE = 200, 8, 0.95
 
 
 class TrainedPrior(NamedTuple):
@@ -102,7 +107,7 @@ def train_prior(
             metadata = {"format": FORMAT, "origin": origin, "step": str(training.step)}
             with atomic_write(kept) as file:
                 file.write(save(training.state(), metadata))
-    save_pixel_net(out, training.mean.cpu())
+    save_pixel_net(out, training.mean.cpu(), familiar_residual(training.mean, parts))
     kept.unlink(missing_ok=True)
     last = losses[-max(1, len(losses) // 10) :]
     loss = sum(last) / len(last) if last else float("nan")
@@ -174,6 +179,17 @@ def cover(shape: Shape) -> CanonicalObject:
         as_tensor(normals),
         torch.zeros(len(means), N_PARTS),  # nothing shades it
     )
+
+
+def familiar_residual(net: PixelNet, parts: list[tuple[Tensor, Tensor, Tensor]]) -> float:
+    """`Denoiser.familiar` of a network that has learned from these meshes' pictures (`mesh_pictures`)."""
+    denoiser = PixelDenoiser(net.cpu())
+    residuals = []
+    for images, azimuths, elevations in parts[:: -(-len(parts) // _ASKED_MESHES)]:
+        some = slice(None, None, -(-len(images) // _ASKED_VIEWS))
+        asked = Conditions(azimuths[some], elevations[some])
+        residuals.append(picture_residual(denoiser, images[some].float() / 255.0, asked))
+    return float(np.quantile(residuals, _ASKED_SHARE))
 
 
 def mesh_pictures(file: Path, views: int, up: str, seed: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -51,6 +51,11 @@ class Denoiser(Protocol):
         """Changes with weights and whatever else estimates depend on, not with where they lie."""
         ...
 
+    @property
+    def familiar(self) -> float | None:
+        """What `residual.picture_residual` is of objects that it learned from; None if that is not known."""
+        ...
+
     def encode(self, images: Tensor) -> Tensor:
         """Pictures [B, 3, image_size, image_size] in [0, 1] to latents [B, c, h, w]; differentiable.
 

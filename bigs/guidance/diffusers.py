@@ -100,6 +100,10 @@ class StableDiffusion:
         return self._edges
 
     @property
+    def familiar(self) -> float | None:
+        return None  # nobody wrote down what it learned from
+
+    @property
     def fingerprint(self) -> str:
         return fingerprint(self._weights, self._settings)
 

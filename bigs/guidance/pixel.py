@@ -112,7 +112,14 @@ def cosine_alphas() -> Tensor:
 class PixelDenoiser:
     """A `Denoiser` over a `PixelNet`; its latents are the pictures in [-1, 1]."""
 
-    def __init__(self, net: PixelNet, guidance_scale: float = 2.0) -> None:
+    def __init__(self, net: PixelNet, guidance_scale: float = 2.0, familiar: float | None = None) -> None:
+        """
+        Args:
+            net: trained.
+            guidance_scale: see `classifier_free`.
+            familiar: see `Denoiser`.
+        """
+        self.familiar = familiar
         self.net = net.eval().requires_grad_(False)
         self.guidance_scale = guidance_scale
         self.alphas_cumprod = cosine_alphas()
@@ -121,7 +128,7 @@ class PixelDenoiser:
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint(self.net.state_dict(), (self.net.config, self.guidance_scale))
+        return fingerprint(self.net.state_dict(), (self.net.config, self.guidance_scale, self.familiar))
 
     def encode(self, images: Tensor) -> Tensor:
         return 2.0 * images - 1.0

@@ -13,12 +13,13 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError
 from bigs.guidance.pixel import PixelConfig, PixelDenoiser, PixelNet
 
-FORMAT = "bigs-pixel-prior-1"
+FORMAT = "bigs-pixel-prior-2"
 
 
-def save_pixel_net(path: Path, net: PixelNet) -> None:
-    """Write a network; whole or not at all."""
-    metadata = {"bigs": json.dumps({"format": FORMAT, "config": asdict(net.config)})}
+def save_pixel_net(path: Path, net: PixelNet, familiar: float) -> None:
+    """Write a network, and what `Denoiser.familiar` says of it; whole or not at all."""
+    about = {"format": FORMAT, "config": asdict(net.config), "familiar": familiar}
+    metadata = {"bigs": json.dumps(about)}
     with atomic_write(path) as file:
         file.write(save({name: value.contiguous() for name, value in net.state_dict().items()}, metadata))
 
@@ -44,9 +45,10 @@ def load_pixel_denoiser(path: Path) -> PixelDenoiser:
     try:
         net = PixelNet(PixelConfig(**metadata["config"]))
         net.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
+        familiar = float(metadata["familiar"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
             f"{path}: expected a whole prior, found one with parts missing ({reason})"
         ) from error
-    return PixelDenoiser(net)
+    return PixelDenoiser(net, familiar=familiar)

@@ -42,9 +42,9 @@ def sds_loss(
     Returns:
         The loss. It is not finite if latents or estimated noise are not; such a step must not be taken.
     """
-    images = _resized(images, denoiser.image_size)
+    images = resized(images, denoiser.image_size)
     if conditions.edges is not None:
-        conditions = conditions._replace(edges=_resized(conditions.edges, denoiser.image_size))
+        conditions = conditions._replace(edges=resized(conditions.edges, denoiser.image_size))
     elif denoiser.detect_edges is not None:
         conditions = conditions._replace(edges=denoiser.detect_edges(images.detach()))
     latents = denoiser.encode(images)
@@ -99,7 +99,8 @@ class _GivenGradient(torch.autograd.Function):
         return upstream[0].to(gradient) * gradient, None
 
 
-def _resized(images: Tensor, size: int) -> Tensor:
+def resized(images: Tensor, size: int) -> Tensor:
+    """Pictures [B, c, H, W] with `size` rows and columns."""
     if images.shape[-2:] == (size, size):
         return images
     return torch.nn.functional.interpolate(images, (size, size), mode="bilinear", antialias=True)

@@ -146,8 +146,13 @@ class GuidanceStage:
     # The stage is skipped when this share of the object was seen, and so are views of which this share was.
     enough: float = 0.9
     well_seen: float = 0.85
-    # What was seen may come to show so much worse; beyond that all is undone.
+    # What was seen may come to show so much worse, and the object may grow so much beyond its mask in any
+    # frame; beyond that all is undone.
     damage: float = 0.02
+    # Weight by which the clip's frames hold what they show of the object as it was found, per pixel.
+    hold: float = 0.3
+    # A prior that says so much more wrongly what was seen than what it learned from does not know the object.
+    unlike: float = 1.4
 
 
 Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | CompletionStage | GuidanceStage

@@ -36,6 +36,8 @@ _NEIGHBOURS = 8
 
 # Told the state after every step, and the loss.
 AfterStep = Callable[[StageState, float], None]
+# The loss by which the clip's frames hold the object as it was found; what it draws, it draws from there.
+Hold = Callable[[CanonicalObject, torch.Generator], Tensor]
 
 
 class Coverage(NamedTuple):
@@ -63,8 +65,7 @@ class Guided:
     """What the prior did."""
 
     moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
-    before: float  # error of the seen part's picture
-    after: float
+    worst: float  # by what share the worst of the faults grew
     rolled_back: bool
 
 
@@ -95,15 +96,17 @@ def guide_object(
     denoiser: Denoiser,
     stage: GuidanceStage,
     settings: RasterSettings,
-    image_error: Callable[[], float],
+    faults: Callable[[], Tensor],
+    hold: Hold | None = None,
     seed: int = 0,
     resume: Mapping[str, Any] | None = None,
     after_step: AfterStep = lambda state, loss: None,
 ) -> Guided:
     """Optimise what was not seen of the object in place by score distillation from virtual cameras.
 
-    No gradient reaches a Gaussian that was seen. Unseen ones can still come to stand before seen ones; so the
-    seen part's error is measured before and after, and all is undone if it grew more than the stage allows.
+    No gradient reaches a Gaussian that was seen. Unseen ones can still come to stand before seen ones, shine
+    through them, or leave the silhouette: `hold` speaks against that, and its faults are measured before and
+    after. All is undone if one of them grew more than the stage allows.
 
     Args:
         detail: the object's own Gaussians, as the stage found them.
@@ -112,7 +115,8 @@ def guide_object(
         denoiser: the prior.
         stage: steps, rates, weights.
         settings: of the renderer.
-        image_error: the error of the pictures of what was seen, as the object is now.
+        faults: [K] positive measures of how badly the object, as it is now, agrees with the clip.
+        hold: added to the prior's loss; see `Hold`.
         seed: of views, timesteps and noise.
         resume: steps done, moments, and what the Gaussians' parameters had become ("reached"), by name.
         after_step: told the state after every step, and the loss.
@@ -134,7 +138,7 @@ def guide_object(
         start = detail().means.clone()
     unseen = ~coverage.seen
     neighbours, spacing = _neighbours(start)
-    before = image_error()
+    before = faults()
     for parameter in parameters.values():
         parameter.requires_grad_(True)
     optimizer = torch.optim.Adam(
@@ -163,6 +167,8 @@ def guide_object(
         # Neighbours move together, so that the surface stays one.
         rough = (detail.shift - detail.shift[neighbours].mean(1)) / spacing
         loss = prior + stage.smooth * rough[unseen].square().sum()
+        if hold is not None:
+            loss = loss + hold(canonical, generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         for parameter in parameters.values():
@@ -171,12 +177,12 @@ def guide_object(
         after_step(StageState.begun(step + 1, optimizer, found), float(loss.detach()))
     for parameter in parameters.values():
         parameter.requires_grad_(False)
-    after = image_error()
-    if after > (1.0 + stage.damage) * before:
+    worst = float((faults() / before.clamp_min(1e-12)).max()) - 1.0
+    if worst > stage.damage:
         _fill(parameters, found)
-        return Guided(torch.zeros_like(start), before, after, True)
+        return Guided(torch.zeros_like(start), worst, True)
     with torch.no_grad():
-        return Guided(detail().means - start, before, after, False)
+        return Guided(detail().means - start, worst, False)
 
 
 @torch.no_grad()

@@ -6,19 +6,25 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from bigs.guidance.cameras import Orbit, make_orbit
-from bigs.guidance.denoiser import Denoiser
+from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
+from bigs.guidance.denoiser import Conditions, Denoiser
+from bigs.guidance.residual import picture_residual
 from bigs.models.object_detail import ObjectDetail, split_object
+from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene
+from bigs.raster.settings import RasterSettings
 from bigs.train.completed_scene import CompletedScene
 from bigs.train.config import GuidanceStage
-from bigs.train.guided import AfterStep, Coverage, coverage_of, follow, guide_object
-from bigs.train.seen import frames_seen, guard_frames, image_error, object_views
-from bigs.train.step import Evidence
+from bigs.train.guided import AfterStep, Coverage, Hold, coverage_of, follow, guide_object, render_object
+from bigs.train.seen import frames_seen, guard_frames, image_error, object_views, overflow
+from bigs.train.step import Evidence, Step
 
 # A Gaussian counts as seen when it shows in so many frames: fewer may be a fault of mask or pose.
 _LEAST_FRAMES = 3
+# The pictures of so many frames are kept to hold the object by.
+_HOLDING_FRAMES = 60
 
 
 @torch.no_grad()
@@ -69,25 +75,89 @@ def guide_scene(
     facts = {"object seen before the prior": f"{coverage.share:.0%} of its Gaussians"}
     if coverage.share >= stage.enough or not (coverage.by_direction < stage.well_seen).any():
         return CompletedScene(f"{coverage.share:.0%} of the object was seen", facts)
-    frames = guard_frames(scene.n_frames)
-
-    def error() -> float:
-        return image_error(scene, evidence, ("object",), frames)
-
     with torch.no_grad():
-        means = detail().means.clone()
+        canonical = detail()
+    strange = strangeness(canonical, coverage, orbit, denoiser, stage, evidence.settings)
+    if strange > stage.unlike:
+        reason = (
+            f"left out, since the prior knows no such object: about what was seen of it, it is {strange:.1f} "
+            f"times as wrong as about what it learned from ({stage.unlike} is allowed)"
+        )
+        return CompletedScene(reason, facts)
+    some, every = guard_frames(scene.n_frames), torch.arange(scene.n_frames)
+
+    def faults() -> Tensor:
+        error = image_error(scene, evidence, ("object",), some)
+        return torch.cat([torch.tensor([error]), overflow(scene, evidence, every)])
+
     done = guide_object(
-        detail, coverage, orbit, denoiser, stage, evidence.settings, error, seed, resume, after_step
+        detail,
+        coverage,
+        orbit,
+        denoiser,
+        stage,
+        evidence.settings,
+        faults,
+        held_by_frames(scene, evidence, canonical, stage.hold),
+        seed,
+        resume,
+        after_step,
     )
-    change = f"{done.after / max(done.before, 1e-12) - 1.0:+.1%}"
     if done.rolled_back:
-        return CompletedScene(f"undone, since what was seen would show worse ({change} error)", facts)
+        reason = f"undone, since the clip's frames would show worse ({done.worst:+.1%} error or size)"
+        return CompletedScene(reason, facts)
     with torch.no_grad():
-        scene.surface_verts.copy_(follow(scene.surface_verts, means, done.moved))
+        scene.surface_verts.copy_(follow(scene.surface_verts, canonical.means, done.moved))
     moved = 1e3 * float(done.moved[~coverage.seen].norm(dim=-1).mean())
     looked = float((coverage.by_direction < stage.well_seen).float().mean())
     facts["prior"] = (
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
-        f"error of what was seen {change}"
+        f"error of what was seen {done.worst:+.1%} at most"
     )
     return CompletedScene(None, facts)
+
+
+def strangeness(
+    canonical: CanonicalObject,
+    coverage: Coverage,
+    orbit: Orbit,
+    denoiser: Denoiser,
+    stage: GuidanceStage,
+    settings: RasterSettings,
+) -> float:
+    """How wrong a prior is about the sides that were seen, as a multiple of what it is on what it knows.
+
+    The sides that were seen are right, so a prior that believes in something else there is no help with the
+    others. 0 of a prior that does not say what it knows.
+    """
+    if denoiser.familiar is None:
+        return 0.0
+    best = coverage.by_direction.argsort(descending=True, stable=True)[: len(coverage.directions) // 10]
+    cameras = virtual_cameras(orbit, coverage.directions[best], stage.image_size)
+    with torch.no_grad():
+        images = render_object(canonical, cameras, stage.image_size, settings)
+    asked = Conditions(cameras.azimuths, cameras.elevations)
+    return picture_residual(denoiser, images, asked) / denoiser.familiar
+
+
+def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject, weight: float) -> Hold:
+    """The distance between what a frame shows of the object and what it showed of `canonical`.
+
+    Summed over the pixels in which nothing hides the object, if it is there; background counts.
+    """
+    frames = torch.linspace(0, scene.n_frames - 1, min(_HOLDING_FRAMES, scene.n_frames)).round().long()
+
+    def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
+        step = Step(scene, evidence, ("object",), {"object": now}, frames, with_labels=False)
+        shown = step.alone("object")
+        free = 1.0 - evidence.targets.hidden("object", frames)
+        return free[..., None] * torch.cat([shown.colors, shown.alphas], dim=-1)
+
+    with torch.no_grad():
+        found = torch.cat([picture(canonical, frame) for frame in frames[:, None]])
+
+    def hold(now: CanonicalObject, generator: torch.Generator) -> Tensor:
+        chosen = torch.randint(len(frames), (1,), generator=generator)
+        return weight * (picture(now, frames[chosen]) - found[chosen]).abs().sum()
+
+    return hold

@@ -32,7 +32,7 @@ _LEAST_OF_STAGE: Mapping[type, Mapping[str, float]] = {
     GraspStage: {"speed": 0.0, "least": 2, "slack": 0.0, "bridge": 0, "longest_move": 0},
     SplitStage: {"parts": 1, "least_opacity": 0.0},
     CompletionStage: {"most_worsening": 0.0},
-    GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0},
+    GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0, "hold": 0.0, "unlike": 0.0},
 }
 # What the renderer is compiled for.
 COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}

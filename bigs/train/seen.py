@@ -66,6 +66,19 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
 
 
 @torch.no_grad()
+def overflow(scene: Scene, evidence: Evidence, frames: Tensor) -> Tensor:
+    """How large the object's picture is in each of some frames [B]: 1 as its mask allows, more beyond it.
+
+    Where hands or something unlabelled may hide it, the mask allows everything.
+    """
+    step = Step(scene, evidence, ("object",), scene.canonical(("object",)), frames, with_labels=False)
+    hidden = evidence.targets.hidden("object", frames)
+    beyond = (1.0 - hidden - step.share("object")).clamp_min(0.0)
+    outside = (beyond * step.alone("object").alphas[..., 0]).sum((1, 2))
+    return 1.0 + outside / step.share("object").sum((1, 2)).clamp_min(1.0)
+
+
+@torch.no_grad()
 def image_error(scene: Scene, evidence: Evidence, entities: Sequence[Entity], frames: Tensor) -> float:
     """Mean absolute error of the colours where some entities, rendered together, show in the clip."""
     step = Step(scene, evidence, tuple(entities), scene.canonical(entities), frames, with_labels=False)

@@ -240,6 +240,12 @@ def test_a_preset_that_is_none(call: Callable[..., Answer], tmp_path: Path) -> N
     assert_refused(answer, "m.yaml", "a: preset", "smoke", "'turbo'")
 
 
+def test_a_preset_beside_a_config(call: Callable[..., Answer], tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text("- {clip: a, preset: fast, config: plan.yaml}\n")
+    answer = call("batch", tmp_path / "m.yaml", "--out", tmp_path / "out")
+    assert_refused(answer, "m.yaml", "a: preset", "found both")
+
+
 def test_another_run_in_the_folder_is_refused(
     call: Callable[..., Answer], clips: Clips, tmp_path: Path
 ) -> None:

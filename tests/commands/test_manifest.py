@@ -102,3 +102,14 @@ def test_what_cannot_be_is_named(tmp_path: Path, name: str, text: str, words: st
 def test_a_missing_manifest_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"m\.txt: expected a manifest, found no such file"):
         read_manifest(tmp_path / "m.txt")
+
+
+def test_an_entrys_plan_is_its_own(tmp_path: Path) -> None:
+    """A configuration of an entry takes the place of the preset that the others have, and the other way."""
+    text = "defaults: {preset: fast}\nclips:\n- {clip: a, config: plan.yaml}\n- b\n"
+    first, second = read_manifest(written(tmp_path, "m.yaml", text))
+    assert (first.preset, first.config) == (None, tmp_path / "plan.yaml")
+    assert (second.preset, second.config) == ("fast", None)
+    text = "defaults: {config: plan.yaml}\nclips:\n- {clip: a, preset: smoke}\n"
+    (only,) = read_manifest(written(tmp_path, "n.yaml", text))
+    assert (only.preset, only.config) == ("smoke", None)

@@ -154,8 +154,9 @@ def test_a_state_of_other_options_is_refused(meshes: Path, tmp_path: Path) -> No
 )
 def test_a_bad_file_is_named(tmp_path: Path, spoil: Callable[[Path], object], message: str) -> None:
     path = tmp_path / "prior.safetensors"
-    save_pixel_net(path, PixelNet(SMALL))
-    assert load_pixel_denoiser(path).image_size == PIXELS
+    save_pixel_net(path, PixelNet(SMALL), 0.1)
+    prior = load_pixel_denoiser(path)
+    assert (prior.image_size, prior.familiar) == (PIXELS, 0.1)
     spoil(path)
     with pytest.raises(InputError, match=message):
         load_pixel_denoiser(path)

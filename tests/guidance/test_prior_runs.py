@@ -17,7 +17,7 @@ from bigs.train.config_file import save_config
 from bigs.train.presets import SMOKE
 
 # The tiny clip shows all of its object: here a view is asked for nevertheless, and any change is kept.
-STAGE = GuidanceStage(steps=3, views=2, image_size=32, enough=2.0, well_seen=2.0, damage=1e9)
+STAGE = GuidanceStage(steps=3, views=2, image_size=32, enough=2.0, well_seen=2.0, damage=1e9, unlike=1e9)
 
 
 @pytest.fixture

@@ -26,13 +26,22 @@ def unseen_score(scene: HalfSeen, verts: np.ndarray) -> ShapeScore:
     )
 
 
-def guided(scene: HalfSeen, stage: GuidanceStage, errors: tuple[float, float] = (1.0, 1.0)) -> Guided:
-    """Guide with the true render's score; the seen part's error is `errors` before and after."""
+Faults = tuple[list[float], list[float]]
+
+
+def guided(scene: HalfSeen, stage: GuidanceStage, errors: Faults = ([1.0], [1.0])) -> Guided:
+    """Guide with the true render's score; the faults are `errors` before and after."""
     answers = iter(errors)
     coverage = coverage_of(scene.detail.normals, scene.seen)
     denoiser = TrueRender(scene, stage.image_size)
     return guide_object(
-        scene.detail, coverage, scene.orbit, denoiser, stage, RasterSettings(), lambda: next(answers)
+        scene.detail,
+        coverage,
+        scene.orbit,
+        denoiser,
+        stage,
+        RasterSettings(),
+        lambda: torch.tensor(next(answers)),
     )
 
 
@@ -57,17 +66,18 @@ def test_the_unseen_half_becomes_the_true_one() -> None:
         )
 
 
-def test_damage_is_undone() -> None:
+@pytest.mark.parametrize("after", [[1.03, 2.0, 1.0], [1.0, 2.0, 1.03]], ids=["error", "size"])
+def test_damage_is_undone(after: list[float]) -> None:
     scene = half_seen(300)
     kept = {name: value.clone() for name, value in scene.detail.state_dict().items()}
-    done = guided(scene, replace(STAGE, steps=5), errors=(1.0, 1.03))
-    assert done.rolled_back and not done.moved.any()
+    done = guided(scene, replace(STAGE, steps=5), errors=([1.0, 2.0, 1.0], after))
+    assert done.rolled_back and not done.moved.any() and done.worst == pytest.approx(0.03)
     for name, value in scene.detail.state_dict().items():
         torch.testing.assert_close(value, kept[name], rtol=0, atol=0)
 
 
 def test_what_shows_a_little_worse_is_kept() -> None:
-    done = guided(half_seen(300), replace(STAGE, steps=5), errors=(1.0, 1.019))
+    done = guided(half_seen(300), replace(STAGE, steps=5), errors=([1.0], [1.019]))
     assert not done.rolled_back and done.moved.any()
 
 
@@ -88,7 +98,7 @@ def test_no_view_of_what_was_seen() -> None:
         Listening(scene, STAGE.image_size),
         replace(STAGE, steps=30, well_seen=0.3),
         RasterSettings(),
-        lambda: 1.0,
+        lambda: torch.ones(1),
     )
     # The front is at azimuth 0; the seen half reaches to a right angle from it.
     assert float(torch.cat(asked).abs().min()) > np.radians(60.0)

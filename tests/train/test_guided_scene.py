@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,8 +20,10 @@ from bigs.hand import HandModel
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
 from bigs.train.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
+from bigs.train.evidence import EvidenceSource
 from bigs.train.fit import FitReport, fit
 from bigs.train.presets import PRESETS, SMOKE
+from bigs.train.seen import image_error, overflow
 from bigs.types import Side
 
 STAGE = GuidanceStage(steps=3, views=2, image_size=32)
@@ -57,6 +60,60 @@ def test_the_unseen_part_moves_and_its_surface_follows(
     assert 0.1 < float((change == 0).float().mean()) < 0.95
     assert float((after.object_surface.verts - before.object_surface.verts).abs().max()) > 1e-5
     assert not any(parameter.requires_grad for parameter in after.parameters())
+
+
+def test_a_prior_that_does_not_know_the_object_is_left_out(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    """It is right about what it learned from, and not about this object: the scene stays as it was."""
+    knowing = PixelDenoiser(prior.net, familiar=1e-4)
+    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+    after, report = run(one_side, both_hands, PLAN, knowing)
+    assert "the prior knows no such object" in report.skipped[0]
+    for name, value in before.state_dict().items():
+        torch.testing.assert_close(after.state_dict()[name], value, rtol=0, atol=0)
+    broad = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, unlike=1e9, damage=1e9)))
+    assert run(one_side, both_hands, broad, knowing)[1].skipped == []
+
+
+def test_the_clips_frames_hold_what_they_show(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    """The same wild prior changes what was seen much less while held, though it still moves the rest."""
+    ends = []
+    for weight in (0.0, 1.0):
+        stage = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, hold=weight)
+        scene, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), stage)), prior)
+        assert "moved" in report.facts["prior"]
+        sources = EvidenceSource(
+            one_side, np.zeros((5, one_side.height, one_side.width), dtype=bool), scene, PLAN, None
+        )
+        evidence = sources.evidence(replace(SMOKE.stages[0], image_size=0))
+        ends.append((image_error(scene, evidence, ("object",), torch.arange(5)), scene, evidence))
+    start = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)[0]
+    found = image_error(start, ends[0][2], ("object",), torch.arange(5))
+    assert abs(ends[1][0] - found) < 0.5 * abs(ends[0][0] - found)
+    assert float((ends[1][1].object_splats().means - start.object_splats().means).abs().max()) > 1e-4
+
+
+def test_an_object_that_leaves_its_mask_is_measured(
+    one_side: Clip, both_hands: dict[Side, HandModel]
+) -> None:
+    scene, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+    unknown = np.zeros((5, one_side.height, one_side.width), dtype=bool)
+    evidence = EvidenceSource(one_side, unknown, scene, PLAN, None).evidence(
+        replace(SMOKE.stages[0], image_size=0)
+    )
+    every = torch.arange(5)
+    before = overflow(scene, evidence, every)
+    assert (before >= 1.0).all() and (before < 1.5).all()
+    scene.object_splats.shift += 0.02
+    assert (overflow(scene, evidence, every) > before + 0.2).all()
+    # Where anything may hide it, it may be.
+    hidden = replace(
+        evidence, targets=replace(evidence.targets, unknown=torch.ones_like(evidence.targets.unknown))
+    )
+    assert (overflow(scene, hidden, every) == 1.0).all()
 
 
 def test_an_object_without_a_split_is_taken_out_of_its_field(
@@ -155,7 +212,7 @@ def test_what_the_options_mean(tmp_path: Path) -> None:
 
 
 def test_weights_are_loaded(tmp_path: Path) -> None:
-    save_pixel_net(tmp_path / "prior.safetensors", PixelNet(PixelConfig(width=16, embedding=32)))
+    save_pixel_net(tmp_path / "prior.safetensors", PixelNet(PixelConfig(width=16, embedding=32)), 0.1)
     weights = str(tmp_path / "prior.safetensors")
     assert isinstance(load_prior(PriorConfig("trained", weights)), PixelDenoiser)
     assert load_prior(PriorConfig("symmetry")) is None
