@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from limited_view import limited_view
+from limited_view import bottle_clip, limited_view
 
 from bigs.data.base import Clip
-from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
-from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
@@ -42,10 +39,8 @@ def bottle(
     tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
 ) -> tuple[Clip, HandObjectTrajectory]:
     """A third of a turn of a bottle, and the truth."""
-    folder = tmp_path_factory.mktemp("bottle") / "clip"
-    path = make_clip(folder, hand_models=both_hands, frames=36, width=240, height=180, seed=2)
-    truth = load_ground_truth(path)
-    return limited_view(load_hold(path), truth, range(12)), truth
+    clip, truth = bottle_clip(tmp_path_factory.mktemp("bottle") / "clip", both_hands)
+    return limited_view(clip, truth, range(12)), truth
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limited_view import limited_view
+from limited_view import bottle_clip, limited_view
 
 from bigs.data.base import Clip
-from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
-from bigs.data.synthetic import make_clip
 from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
@@ -29,10 +26,7 @@ INITIAL = InitialConfig(surface_resolution=56)
 def bottle(
     tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
 ) -> tuple[Clip, HandObjectTrajectory]:
-    """A whole turn of a bottle, and the truth."""
-    folder = tmp_path_factory.mktemp("bottle") / "clip"
-    path = make_clip(folder, hand_models=both_hands, frames=36, width=240, height=180, seed=2)
-    return load_hold(path), load_ground_truth(path)
+    return bottle_clip(tmp_path_factory.mktemp("bottle") / "clip", both_hands)
 
 
 @pytest.fixture(scope="module")
