@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+
+# What numpy and zipfile raise of an archive that is damaged (a flipped bit may look like any), encrypted
+# (RuntimeError) or of an unknown compression (NotImplementedError, which is one).
+ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    AttributeError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class InputError(ValueError):

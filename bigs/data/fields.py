@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bigs.checks import InputError, check_finite, check_shape
+from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape
 
 
 def mapping_field(where: str, value: Any) -> Mapping[str, Any]:
@@ -65,7 +64,7 @@ def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
             return {key: stored[key] for key in stored.files}
     except FileNotFoundError:
         raise InputError(f"{path}: expected {what}, found no such file") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except ARCHIVE_ERRORS as error:
         raise InputError(
             f"{path}: expected an .npz of plain arrays, found {error or type(error).__name__}"
         ) from None

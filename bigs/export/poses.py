@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, check_finite, check_shape
+from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-poses-1"
@@ -79,9 +78,9 @@ def load_poses(path: str | Path) -> ClipPoses:
     if not Path(path).is_file():
         raise InputError(f"{path}: expected a poses file, found no such file")
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except ARCHIVE_ERRORS as error:
         raise InputError(f"{path}: expected an npz file, found a damaged one ({error})") from error
     found = str(arrays.get("format", "none"))
     if found != FORMAT:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import ARCHIVE_ERRORS, InputError
 from bigs.export.challenge import validate_challenge
 from bigs.types import ENTITIES
 
@@ -117,8 +117,7 @@ def _check_archive(where: str, buffer: io.BytesIO, sequences: Sequence[str]) -> 
 def _member(archive: zipfile.ZipFile, where: str, info: zipfile.ZipInfo) -> bytes:
     try:
         return archive.read(info)
-    # zipfile says RuntimeError of an encrypted member, NotImplementedError of a compression it does not know.
-    except (zipfile.BadZipFile, OSError, EOFError, RuntimeError, NotImplementedError) as error:
+    except ARCHIVE_ERRORS as error:
         raise InputError(
             f"{where}: {info.filename}: expected a whole file, found a damaged one ({error})"
         ) from None

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
-from bigs.checks import InputError, check_choice, check_finite, check_shape
+from bigs.checks import ARCHIVE_ERRORS, InputError, check_choice, check_finite, check_shape
 from bigs.hand.model import MANO_PARENTS, HandModel
 from bigs.hand.procedural import procedural_hand
 from bigs.types import SIDES, Side
@@ -161,7 +159,7 @@ def _read_npz(file: Path) -> dict[str, Any]:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("a single array")
             return {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except ARCHIVE_ERRORS as error:
         reason = str(error) or "nothing"
         raise InputError(f"{file}: expected an .npz archive of plain arrays, found: {reason}") from error
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import ARCHIVE_ERRORS, InputError
 from bigs.data.base import HandTrack
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.types import SIDES, Side
@@ -376,7 +375,7 @@ def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.nda
             return {key: stored[key] for key in stored.files if keys is None or key in keys}
     except FileNotFoundError:
         raise InputError(f"{file}: expected what an earlier step writes, found no such file") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except ARCHIVE_ERRORS as error:
         raise InputError(
             f"{file}: expected an .npz of plain arrays, found {error or type(error).__name__}"
         ) from None
