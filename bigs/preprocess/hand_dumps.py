@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import array_field, mapping_field, read_npz, require
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.matching import match_count, match_names
 from bigs.types import SIDES, Side
@@ -114,11 +114,7 @@ def _load(file: Path) -> Mapping[str, Any]:
     if not file.is_file():
         raise InputError(f"{file}: expected a file of hand estimates (.npy or .npz), found nothing")
     if file.suffix == ".npz":
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                return {key: stored[key] for key in stored.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{file}: expected an .npz of plain arrays, found {error}") from None
+        return read_npz(file, "an .npz of hand estimates")
     return mapping_field(str(file), load_npy(file))
 
 
