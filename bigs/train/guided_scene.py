@@ -150,7 +150,7 @@ def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject,
     def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
         step = Step(scene, evidence, ("object",), {"object": now}, frames, with_labels=False)
         shown = step.alone("object")
-        free = 1.0 - evidence.targets.hidden("object", frames)
+        free = 1.0 - step.hidden_alone("object")
         return free[..., None] * torch.cat([shown.colors, shown.alphas], dim=-1)
 
     with torch.no_grad():

@@ -72,7 +72,7 @@ def overflow(scene: Scene, evidence: Evidence, frames: Tensor) -> Tensor:
     Where hands or something unlabelled may hide it, the mask allows everything.
     """
     step = Step(scene, evidence, ("object",), scene.canonical(("object",)), frames, with_labels=False)
-    hidden = evidence.targets.hidden("object", frames)
+    hidden = step.hidden_alone("object")
     beyond = (1.0 - hidden - step.share("object")).clamp_min(0.0)
     outside = (beyond * step.alone("object").alphas[..., 0]).sum((1, 2))
     return 1.0 + outside / step.share("object").sum((1, 2)).clamp_min(1.0)
