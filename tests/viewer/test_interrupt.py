@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pytest
@@ -16,6 +16,15 @@ from bigs.viewer.app import Viewer
 from bigs.viewer.stage import Pose, Stage, Subject
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """What a shell starts in the background is deaf to interrupts, and so is all that it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_viewer_closes_when_its_drawing_has_ended() -> None:
     drawing, ended = threading.Event(), threading.Event()
 

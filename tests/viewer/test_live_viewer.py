@@ -33,9 +33,12 @@ RIGHT, LEFT, OBJECT = (225, 87, 89), (78, 121, 167), (237, 201, 72)
 @pytest.fixture(scope="module")
 def address(finished_run: Run, tiny_clip: Path) -> Iterator[str]:
     command = ["view", str(finished_run.folder), "--gt", str(tiny_clip / "gt.npz"), "--port", "0"]
+    # What a shell starts in the background is deaf to interrupts, and so is all that it starts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     server = subprocess.Popen(
         [sys.executable, "-u", "-m", "bigs.cli", *command], stdout=subprocess.PIPE, text=True
     )
+    signal.signal(signal.SIGINT, before)
     assert server.stdout is not None
     line = server.stdout.readline()
     found = re.fullmatch(r"(http://127\.0\.0\.1:\d+) \(Ctrl-C ends\)\n", line)
