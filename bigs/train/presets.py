@@ -165,7 +165,7 @@ _JOINT = OptimizeStage(
 _DETAIL = replace(
     _JOINT,
     name="detail",
-    steps=150,
+    steps=120,
     lrs={
         **_JOINT.lrs,
         "hand.orient": 0.002,
