@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-# What numpy and zipfile raise of an archive that is damaged (a flipped bit may look like any), encrypted
-# (RuntimeError) or of an unknown compression (NotImplementedError, which is one).
+# What numpy and zipfile raise of an archive that is damaged (a flipped bit may look like any), encrypted or
+# of an unknown compression (both RuntimeError).
 ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     ValueError,

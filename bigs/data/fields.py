@@ -57,11 +57,11 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: expected JSON, found {error}") from None
 
 
-def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file, or an InputError that calls what was wanted `what`."""
+def read_npz(path: Path, what: str, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, or some of them, or an InputError that calls what was wanted `what`."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files}
+            return {key: stored[key] for key in stored.files if keys is None or key in keys}
     except FileNotFoundError:
         raise InputError(f"{path}: expected {what}, found no such file") from None
     except ARCHIVE_ERRORS as error:

@@ -75,9 +75,8 @@ def matrix_to_quat(matrices: Tensor) -> Tensor:
     Every row of q q^T is q times one of its parts; the row of the largest part is the one to take.
     """
     flat = matrices.reshape(-1, 9)
-    outer = (flat @ _OUTER.to(flat)).unflatten(-1, (4, 4)) + torch.eye(
-        4, dtype=flat.dtype, device=flat.device
-    )
+    identity = torch.eye(4, dtype=flat.dtype, device=flat.device)
+    outer = (flat @ _OUTER.to(flat)).unflatten(-1, (4, 4)) + identity
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     rows = outer[torch.arange(len(flat), device=flat.device), largest]
     return torch.nn.functional.normalize(rows, dim=-1).reshape(*matrices.shape[:-2], 4)

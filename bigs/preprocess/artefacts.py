@@ -23,9 +23,9 @@ from typing import Any, Literal
 import numpy as np
 
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError
+from bigs.checks import InputError
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import array_field, mapping_field, read_npz, require
 from bigs.types import SIDES, Side
 
 VERSION = 1
@@ -370,15 +370,7 @@ def _read_json(file: Path) -> Mapping[str, Any]:
 
 
 def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files if keys is None or key in keys}
-    except FileNotFoundError:
-        raise InputError(f"{file}: expected what an earlier step writes, found no such file") from None
-    except ARCHIVE_ERRORS as error:
-        raise InputError(
-            f"{file}: expected an .npz of plain arrays, found {error or type(error).__name__}"
-        ) from None
+    return read_npz(file, "what an earlier step writes", keys)
 
 
 def _plain(value: Any) -> Any:
