@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import torch
 
 from bigs.checks import InputError, check_choice, check_finite
 from bigs.raster import cuda, reference, rust, sh
-from bigs.raster.arguments import Batch, batch_of, check_cameras, check_kind
+from bigs.raster.arguments import Batch, batch_of, check_cameras, check_kind, shapes_of, slabs_of
 from bigs.raster.settings import RasterSettings
 from bigs.types import RenderOutput
 
@@ -118,7 +117,7 @@ def rasterization(
     if sh_degree is not None:
         check_choice("sh_degree", sh_degree, sh.DEGREES)
         sh.check_coefficients("colors", sh_degree, colors)
-    batch = batch_of(tensors, pixel_mask, width, height, sh_degree)
+    batch = batch_of(shapes_of(tensors, pixel_mask), width, height, sh_degree)
     if backend == "auto":
         backend = "gsplat" if means.is_cuda else "rust"
     if backend == "rust":
@@ -201,33 +200,15 @@ def _render_rust(
     camera_model: CameraModel,
     extras: rust.Extras,
 ) -> RenderOutput:
-    # Axes of each input's own, in the engine's order, and whether the camera's comes before them.
-    axes = {
-        "means": (2, False),
-        "quats": (2, False),
-        "scales": (2, False),
-        "opacities": (1, False),
-        "colors": (2, batch.colors_per_camera),
-        "viewmats": (2, True),
-        "Ks": (2, True),
-        "backgrounds": (1, True),
-        "pixel_mask": (2, True),
-    }
-    entries = math.prod(batch.shape)
-    inputs, counts = [], []
-    for name, (own, camera_axis) in axes.items():
-        tensor = pixel_mask if name == "pixel_mask" else tensors.get(name)
-        count = 1
-        if tensor is not None:
-            lead = tensor.shape[: tensor.ndim - own - camera_axis]
-            count = math.prod(lead)
-            if count != 1 and lead != batch.shape:
-                tensor = tensor.expand(*batch.shape, *tensor.shape[len(lead) :])
-                count = entries
-        inputs.append(tensor)
-        counts.append((count, batch.cameras if camera_axis and tensor is not None else 1))
+    slabs = slabs_of(shapes_of(tensors, pixel_mask), batch)
+    inputs = (*tensors.values(), *([] if "backgrounds" in tensors else [None]), pixel_mask)
+    if any(slabs.shapes):
+        inputs = tuple(
+            tensor if shape is None else cast(torch.Tensor, tensor).expand(shape)
+            for tensor, shape in zip(inputs, slabs.shapes, strict=True)
+        )
     call = rust.Call(
-        tuple(counts),
+        slabs.counts,
         (*batch.shape, batch.cameras),
         batch.width,
         batch.height,
@@ -235,7 +216,7 @@ def _render_rust(
         render_mode,
         camera_model,
     )
-    return RenderOutput(*rust.rasterize(tuple(inputs), call, extras))
+    return RenderOutput(*rust.rasterize(inputs, call, extras))
 
 
 def _expanded(tensors: dict[str, torch.Tensor], batch: Batch) -> dict[str, torch.Tensor]:

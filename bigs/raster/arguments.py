@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from bigs.checks import InputError, check_finite, check_shape
+from bigs.checks import InputError, check_finite
 
 # A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
 _SINGULAR = 1e-9
+# What follows from shapes alone is worked out once for each of so many: in a loop they come again and again.
+_REMEMBERED = 64
+
+# Of each input that is there its name and shape.
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]
+
+# The engine's order of inputs, how many axes are each one's own, and whether the camera's comes before them;
+# that of colours depends.
+_AXES = {
+    "means": (2, False),
+    "quats": (2, False),
+    "scales": (2, False),
+    "opacities": (1, False),
+    "colors": (2, None),
+    "viewmats": (2, True),
+    "Ks": (2, True),
+    "backgrounds": (1, True),
+    "pixel_mask": (2, True),
+}
 
 
 class Batch(NamedTuple):
@@ -50,13 +71,22 @@ def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None
             )
 
 
-def batch_of(
-    tensors: dict[str, torch.Tensor],
-    pixel_mask: torch.Tensor | None,
-    width: int,
-    height: int,
-    sh_degree: int | None,
-) -> Batch:
+class Slabs(NamedTuple):
+    """How the engine is to read the inputs, one entry for each that it takes, in its order."""
+
+    counts: tuple[tuple[int, int], ...]
+    """How many batch entries and cameras (or 1: shared) the leading axes stand for."""
+    shapes: tuple[tuple[int, ...] | None, ...]
+    """The shape to expand an input to where its batch axes broadcast along some only."""
+
+
+def shapes_of(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None) -> Shapes:
+    """The shapes of all inputs."""
+    shapes = tuple([(name, tensor.shape) for name, tensor in tensors.items()])
+    return shapes if pixel_mask is None else (*shapes, ("pixel_mask", pixel_mask.shape))
+
+
+def batch_of(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> Batch:
     """The sizes of all inputs.
 
     Raises:
@@ -65,14 +95,20 @@ def batch_of(
     for name, size in (("width", width), ("height", height)):
         if not isinstance(size, int | np.integer) or size < 1:
             raise InputError(f"{name}: expected a positive whole number of pixels, found {size!r}")
+    return _fitted(shapes, int(width), int(height), sh_degree)
+
+
+@lru_cache(_REMEMBERED)
+def _fitted(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> Batch:
+    found = {name: tuple(shape) for name, shape in shapes}
     # A tensor with too few axes to tell a size fails its own check below, whatever this says.
-    n = tensors["means"].shape[-2] if tensors["means"].ndim >= 2 else 1
-    cameras = tensors["viewmats"].shape[-3] if tensors["viewmats"].ndim >= 3 else 1
-    channels = tensors["colors"].shape[-1] if tensors["colors"].ndim >= 2 else 1
+    n = found["means"][-2] if len(found["means"]) >= 2 else 1
+    cameras = found["viewmats"][-3] if len(found["viewmats"]) >= 3 else 1
+    channels = found["colors"][-1] if len(found["colors"]) >= 2 else 1
     if channels == 0 or cameras == 0:
         name, what = ("colors", "channel") if channels == 0 else ("viewmats", "camera")
-        raise InputError(f"{name}: expected at least one {what}, found shape {list(tensors[name].shape)}")
-    color = (channels,) if sh_degree is None else tuple(tensors["colors"].shape[-2:])
+        raise InputError(f"{name}: expected at least one {what}, found shape {list(found[name])}")
+    color = (channels,) if sh_degree is None else found["colors"][-2:]
     trailing: dict[str, tuple[int, ...]] = {
         "means": (n, 3),
         "quats": (n, 4),
@@ -85,22 +121,44 @@ def batch_of(
         "pixel_mask": (cameras, height, width),
     }
     leading: dict[str, tuple[int, ...]] = {}
-    for name, tensor in (tensors if pixel_mask is None else {**tensors, "pixel_mask": pixel_mask}).items():
+    for name, shape in found.items():
         expected = trailing[name]
-        if tuple(tensor.shape[max(tensor.ndim - len(expected), 0) :]) != expected:
+        if shape[max(len(shape) - len(expected), 0) :] != expected:
             shown = ", ".join(map(str, ("...", *expected)))
-            raise InputError(f"{name}: expected shape [{shown}], found {list(tensor.shape)}")
-        leading[name] = tuple(tensor.shape[: tensor.ndim - len(expected)])
+            raise InputError(f"{name}: expected shape [{shown}], found {list(shape)}")
+        leading[name] = shape[: len(shape) - len(expected)]
 
     depth = max(len(axes) for name, axes in leading.items() if name != "colors")
     colors_per_camera = len(leading["colors"]) == depth + 1
     if colors_per_camera:
-        check_shape("colors", tensors["colors"], [None] * depth + [cameras, n, *color])
+        if leading["colors"][-1] != cameras:
+            shown = ", ".join(map(str, (*["any"] * depth, cameras, n, *color)))
+            raise InputError(f"colors: expected shape [{shown}], found {list(found['colors'])}")
         leading["colors"] = leading["colors"][:-1]
-    shape = _broadcast(leading)
-    if 0 in shape:
-        raise InputError(f"batch axes: expected at least one entry, found {list(shape)}")
-    return Batch(shape, cameras, int(width), int(height), colors_per_camera, sh_degree)
+    batch = _broadcast(leading)
+    if 0 in batch:
+        raise InputError(f"batch axes: expected at least one entry, found {list(batch)}")
+    return Batch(batch, cameras, width, height, colors_per_camera, sh_degree)
+
+
+@lru_cache(_REMEMBERED)
+def slabs_of(shapes: Shapes, batch: Batch) -> Slabs:
+    """How the engine is to read inputs of these shapes, which `batch_of` has found to fit."""
+    found = dict(shapes)
+    counts: list[tuple[int, int]] = []
+    wider: list[tuple[int, ...] | None] = []
+    for name, (own, per_camera) in _AXES.items():
+        per_camera = batch.colors_per_camera if per_camera is None else per_camera
+        count, shape = 1, None
+        if name in found:
+            depth = len(found[name]) - own - per_camera
+            lead, rest = tuple(found[name][:depth]), tuple(found[name][depth:])
+            count = math.prod(lead)
+            if count != 1 and lead != batch.shape:
+                count, shape = math.prod(batch.shape), (*batch.shape, *rest)
+        counts.append((count, batch.cameras if per_camera and name in found else 1))
+        wider.append(shape)
+    return Slabs(tuple(counts), tuple(wider))
 
 
 def _broadcast(leading: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
