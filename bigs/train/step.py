@@ -38,6 +38,7 @@ class Pixels(NamedTuple):
     colors: Tensor  # [M, D] rendered
     images: Tensor  # [M, 3]
     foreground: Tensor  # [M]
+    empty: Tensor  # [M] share that shows no subject, nor anything unlabelled that may hide one
     shares: Tensor  # [M, E] for the entities rendered
     n_outside: Tensor  # [] pixels of the whole images that show nothing
 
@@ -147,8 +148,14 @@ class Step:
             return values.flatten(0, 2).index_select(0, index)
 
         shares = torch.stack([self.share(entity).flatten()[index] for entity in self.entities], dim=-1)
+        shown = some(foreground)
         return Pixels(
-            some(rendered.colors), some(self.images), some(foreground), shares, (1.0 - foreground).sum()
+            some(rendered.colors),
+            some(self.images),
+            shown,
+            (1.0 - shown - some(_at(self.evidence.targets.unknown, self.frames))).clamp_min(0.0),
+            shares,
+            (1.0 - foreground).sum(),
         )
 
     @cached_property

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bigs.losses.contact import center_contact, penetration, surface_contact
-from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on
+from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on, spilled
 from bigs.losses.perceptual import masked_perceptual
 from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
@@ -99,6 +99,11 @@ def ssim_together(step: Step) -> Tensor:
 def mask_together(step: Step) -> Tensor:
     pixels = step.pixels
     return outside_mask(pixels.colors[:, :3], pixels.foreground, pixels.n_outside)
+
+
+def spill(step: Step) -> Tensor:
+    pixels = step.pixels
+    return spilled(pixels.colors[:, :3], pixels.empty, pixels.foreground)
 
 
 def mask_random_together(step: Step) -> Tensor:
@@ -272,6 +277,7 @@ IMAGE_TERMS: dict[str, dict[str, Callable[[Step], Tensor]]] = {
         "ssim": ssim_together,
         "perceptual": perceptual_together,
         "mask": mask_together,
+        "spill": spill,
         "mask_random": mask_random_together,
         "labels": labels,
     },

@@ -11,7 +11,7 @@ import torch
 from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
 
 from bigs.hand import HandModel
-from bigs.losses.mask import label_difference, outside_mask
+from bigs.losses.mask import label_difference, outside_mask, spilled
 from bigs.losses.photometric import masked_l1, masked_mse
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
@@ -142,7 +142,9 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     """Terms that look at each pixel for itself leave out those that are black and should be."""
     targets = evidence.targets
     shares = {entity: share * (torch.arange(40) < 25) for entity, share in targets.shares.items()}
-    evidence = replace(evidence, targets=replace(targets, shares=shares))
+    unknown = torch.zeros_like(targets.unknown)
+    unknown[:, :8] = 0.7
+    evidence = replace(evidence, targets=replace(targets, shares=shares, unknown=unknown))
     frames = torch.tensor([0, 2])
     step = Step(scene, evidence, scene.entities, scene.canonical(scene.entities), frames)
     assert 0 < len(step.pixels.colors) < 2 * 30 * 40
@@ -153,6 +155,11 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
         "image": masked_l1(rendered[..., :3], images, foreground),
         "mse": masked_mse(rendered[..., :3], images, foreground),
         "mask": outside_mask(rendered[..., :3], foreground),
+        "spill": spilled(
+            rendered[..., :3].flatten(0, 2),
+            (1.0 - foreground - unknown[frames]).clamp_min(0.0).flatten(),
+            foreground,
+        ),
         "labels": label_difference(rendered[..., 3:], labels),
     }
     for name, value in whole.items():
