@@ -19,18 +19,18 @@ def outside_mask(pred: Tensor, foreground: Tensor, n_outside: Tensor | None = No
     return (pred.abs() * outside[..., None]).sum() / (count * pred.shape[-1]).clamp_min(1.0)
 
 
-def spilled(pred: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:
-    """Squared colour where nothing is, in the unit of `masked_mse`: a sum over pixels per pixel of the masks.
+def spilled(alphas: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:
+    """Squared alpha where nothing is, per pixel of the masks.
 
     A mean over the outside would count a pixel there the less the more of them there are, and Gaussians that
-    may grow would rather glow beyond an outline than miss it.
+    may grow would rather glow beyond an outline than miss it. Colour would let black ones stand anywhere.
 
     Args:
-        pred: [M, 3], rendered on black.
+        alphas: [M, 1] rendered.
         empty: [M] in [0, 1], the share of each pixel that should show nothing.
         foreground: [M] in [0, 1], union of all subjects' masks.
     """
-    return (pred.square() * empty[:, None]).sum() / (foreground.sum() * pred.shape[-1]).clamp_min(1.0)
+    return (alphas.square() * empty[:, None]).sum() / foreground.sum().clamp_min(1.0)
 
 
 def outside_mask_on(colors: Tensor, alphas: Tensor, foreground: Tensor, generator: torch.Generator) -> Tensor:

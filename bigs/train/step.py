@@ -32,10 +32,15 @@ class Evidence:
     perceptual: VggWeights | None = None  # what the term "perceptual" needs
 
 
+# A pixel counts as covered by something unlabelled when more than this share of it is.
+_COVERED = 0.5
+
+
 class Pixels(NamedTuple):
-    """The M pixels of a joint rendering that count: all others show nothing and should."""
+    """The M pixels of a joint rendering that count: all others show nothing and should, or are covered."""
 
     colors: Tensor  # [M, D] rendered
+    alphas: Tensor  # [M, 1] rendered
     images: Tensor  # [M, 3]
     foreground: Tensor  # [M]
     empty: Tensor  # [M] share that shows no subject, nor anything unlabelled that may hide one
@@ -139,9 +144,13 @@ class Step:
 
     @cached_property
     def pixels(self) -> Pixels:
-        """For terms that look at each pixel for itself: hands and object fill a small part of an image."""
+        """For terms that look at each pixel for itself: hands and object fill a small part of an image.
+
+        What something unlabelled covers is left out: behind a sleeve a hand may be, but does not show.
+        """
         rendered, foreground = self.together, self.foreground
-        counts = (foreground > 0.0) | (rendered.alphas.squeeze(-1) > 0.0)
+        unknown = _at(self.evidence.targets.unknown, self.frames)
+        counts = ((foreground > 0.0) | (rendered.alphas.squeeze(-1) > 0.0)) & (unknown <= _COVERED)
         index = torch.nonzero(counts.flatten()).flatten()
 
         def some(values: Tensor) -> Tensor:
@@ -151,9 +160,10 @@ class Step:
         shown = some(foreground)
         return Pixels(
             some(rendered.colors),
+            some(rendered.alphas),
             some(self.images),
             shown,
-            (1.0 - shown - some(_at(self.evidence.targets.unknown, self.frames))).clamp_min(0.0),
+            (1.0 - shown - some(unknown)).clamp_min(0.0),
             shares,
             (1.0 - foreground).sum(),
         )

@@ -103,7 +103,7 @@ def mask_together(step: Step) -> Tensor:
 
 def spill(step: Step) -> Tensor:
     pixels = step.pixels
-    return spilled(pixels.colors[:, :3], pixels.empty, pixels.foreground)
+    return spilled(pixels.alphas, pixels.empty, pixels.foreground)
 
 
 def mask_random_together(step: Step) -> Tensor:

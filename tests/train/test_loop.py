@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
 
 from bigs.hand import HandModel
@@ -21,6 +22,7 @@ from bigs.train.grasps import find_grasps
 from bigs.train.loop import StageProgress, StageState, choose_frames, run_stage, stage_entities
 from bigs.train.optim import GROUPS, group_parameters
 from bigs.train.step import Evidence, Step
+from bigs.train.targets import Targets
 from bigs.train.terms import IMAGE_TERMS, TERMS
 from bigs.types import Side
 
@@ -142,9 +144,7 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     """Terms that look at each pixel for itself leave out those that are black and should be."""
     targets = evidence.targets
     shares = {entity: share * (torch.arange(40) < 25) for entity, share in targets.shares.items()}
-    unknown = torch.zeros_like(targets.unknown)
-    unknown[:, :8] = 0.7
-    evidence = replace(evidence, targets=replace(targets, shares=shares, unknown=unknown))
+    evidence = replace(evidence, targets=replace(targets, shares=shares))
     frames = torch.tensor([0, 2])
     step = Step(scene, evidence, scene.entities, scene.canonical(scene.entities), frames)
     assert 0 < len(step.pixels.colors) < 2 * 30 * 40
@@ -155,16 +155,30 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
         "image": masked_l1(rendered[..., :3], images, foreground),
         "mse": masked_mse(rendered[..., :3], images, foreground),
         "mask": outside_mask(rendered[..., :3], foreground),
-        "spill": spilled(
-            rendered[..., :3].flatten(0, 2),
-            (1.0 - foreground - unknown[frames]).clamp_min(0.0).flatten(),
-            foreground,
-        ),
+        "spill": spilled(step.together.alphas.flatten(0, 2), 1.0 - foreground.flatten(), foreground),
         "labels": label_difference(rendered[..., 3:], labels),
     }
     for name, value in whole.items():
         torch.testing.assert_close(IMAGE_TERMS["interacting-subjects"][name](step), value)
         assert value > 0.0, name
+
+
+@pytest.mark.parametrize("name", ["image", "mse", "mask", "spill", "labels"])
+def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, name: str) -> None:
+    """No term of single pixels pulls at what is rendered there."""
+    targets = evidence.targets
+    nothing = {entity: torch.zeros_like(share) for entity, share in targets.shares.items()}
+    covered = replace(targets, shares=nothing, unknown=torch.ones_like(targets.unknown))
+    bare = replace(targets, shares=nothing, unknown=torch.zeros_like(targets.unknown))
+
+    def term(targets: Targets) -> Tensor:
+        frames, canonical = torch.tensor([0, 2]), scene.canonical(scene.entities)
+        step = Step(scene, replace(evidence, targets=targets), scene.entities, canonical, frames)
+        return IMAGE_TERMS["interacting-subjects"][name](step)
+
+    assert term(covered) == 0.0
+    if name in ("mask", "spill", "labels"):
+        assert term(bare) > 0.0
 
 
 def test_skinning_and_scale_are_reached_too(scene: Scene, evidence: Evidence) -> None:
