@@ -115,9 +115,8 @@ def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: np.ndarray
     if tensor is None or not wanted:
         return None
     if gradient.size == tensor.numel():
-        return torch.from_numpy(
-            gradient.reshape(tensor.shape)
-        )  # numpy's reshape takes a tenth of torch's time
+        # Shaped by numpy, which takes less time for it than torch.
+        return torch.from_numpy(gradient.reshape(tensor.shape))
     # Of a world-to-camera matrix the engine returns three rows; the last is constant.
     rows = torch.from_numpy(gradient.reshape(*tensor.shape[:-2], 3, 4))
     return torch.cat([rows, torch.zeros_like(rows[..., :1, :])], dim=-2)
