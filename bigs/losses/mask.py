@@ -6,17 +6,15 @@ import torch
 from torch import Tensor
 
 
-def outside_mask(pred: Tensor, foreground: Tensor, n_outside: Tensor | None = None) -> Tensor:
+def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
     """The paper's mask regulariser (1 - m) I_pred (Eq. 5), a mean over the outside's pixels and channels.
 
     Args:
         pred: [..., D], rendered on black.
         foreground: [...] in [0, 1], union of all subjects' masks.
-        n_outside: how many pixels are outside, where `pred` lacks those that are black.
     """
     outside = 1.0 - foreground
-    count = outside.sum() if n_outside is None else n_outside
-    return (pred.abs() * outside[..., None]).sum() / (count * pred.shape[-1]).clamp_min(1.0)
+    return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
 
 
 def spilled(alphas: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:

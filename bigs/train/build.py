@@ -12,8 +12,8 @@ from torch import Tensor
 
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
-from bigs.geometry.mesh import sample_surface
-from bigs.geometry.surface import extract_mesh
+from bigs.geometry.mesh import face_areas, sample_surface
+from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.hand import HandModel, shared_betas
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.lighting import Lighting
@@ -29,6 +29,7 @@ from bigs.train.initial import (
     smooth_hand,
     smooth_object,
 )
+from bigs.train.support import Support, seen_samples
 from bigs.types import Side
 
 
@@ -68,22 +69,18 @@ def build_scene(
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
-        try:
-            carving = carve(clip, unknown, start, initial)
-            grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
-            verts, faces = extract_mesh(grid)
-        except (ValueError, scipy.spatial.QhullError) as reason:
-            skipped.append(f"object surface from masks: {reason}; the points' convex hull stands in for it")
-            grid = convex_surface(start, initial)
-            verts, faces = extract_mesh(grid)
+        surfaces = _object_surfaces(clip, unknown, start, initial)
+        skipped += surfaces.skipped
+        verts, faces = surfaces.closed
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
+        verts, faces = surfaces.kept
         object_parts = {
             "object_splats": ObjectSplats(points, normals, _nearest_colors(points, start), obj),
             "object_poses": ObjectPoses(start.rotations, start.centers),
             "object_surface": ObjectSurface(
                 torch.as_tensor(verts, dtype=torch.float32), torch.as_tensor(faces.copy())
             ),
-            "object_distance": DistanceField(grid),
+            "object_distance": DistanceField(surfaces.solid),
         }
     n_frames = len(clip)
     present = [*clip.hands, *(["object"] if clip.object is not None else [])]
@@ -101,6 +98,37 @@ def build_scene(
         **object_parts,
     )
     return SceneStart(scene, skipped)
+
+
+class _ObjectSurfaces(NamedTuple):
+    """The object's surface, for each use."""
+
+    closed: tuple[np.ndarray, np.ndarray]  # vertices and faces; Gaussians start on it
+    kept: tuple[np.ndarray, np.ndarray]  # of the mesh, which ends where nothing speaks for it
+    solid: DistanceGrid  # what hands touch
+    skipped: list[str]
+
+
+def _object_surfaces(
+    clip: Clip, unknown: np.ndarray, start: ObjectStart, initial: InitialConfig
+) -> _ObjectSurfaces:
+    try:
+        carving = carve(clip, unknown, start, initial)
+        grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
+        closed = extract_mesh(grid)
+    except (ValueError, scipy.spatial.QhullError) as reason:
+        grid = convex_surface(start, initial)
+        closed = extract_mesh(grid)
+        why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
+        return _ObjectSurfaces(closed, closed, grid, [why])
+    support = Support(seen_samples(carving, grid, initial), carving.points)
+    kept = support.known_part(*closed, initial.surface_kept)
+    left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
+    skipped = []
+    if left_out > 0.005:
+        reach = f"{1e3 * initial.surface_kept:.0f} mm"
+        skipped.append(f"{left_out:.0%} of the object's surface: further than {reach} from anything seen")
+    return _ObjectSurfaces(closed, kept, support.without_guesses(grid, initial.surface_solid), skipped)
 
 
 def _canonical_hands(

@@ -8,13 +8,13 @@ import numpy as np
 import scipy.ndimage
 import scipy.spatial
 
-from bigs.geometry.coverage import times_empty, times_seen
-from bigs.geometry.mesh import sample_surface
-from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.coverage import times_empty
+from bigs.geometry.surface import DistanceGrid
 from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
 from bigs.train.carving import Carving
 from bigs.train.initial import InitialConfig, ObjectStart
+from bigs.train.support import seen_samples
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,6 @@ class CompletionConfig:
     symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
     # Nothing is completed when this share of the surface was seen.
     enough: float = 0.9
-    # A part counts as seen when it shows in so many frames; fewer may be a fault of mask or pose.
-    least_frames: int = 3
-    # Poses are wrong by about so much: nearer surface does not hide, and nothing is known to be empty nearer.
-    tolerance: float = 0.006
     # Seen surface speaks for a symmetry only this near to a point: elsewhere it may be the hull's alone.
     measured: float = 0.008
     # A carried point is new when it is further than this from all others.
@@ -58,21 +54,8 @@ class Completion:
         return f"{found} found, {len(self.points)} points added where nothing was seen"
 
 
-# Samples of the surface that are looked at, and those that may hide them.
-_SAMPLES, _OCCLUDERS = 4000, 20_000
 # Of that tolerance the hull, which three frames agree on, takes this share.
 _OUTSIDE = 0.67
-
-
-def seen_samples(
-    carving: Carving, surface: DistanceGrid, config: CompletionConfig
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Even samples of a surface: points [N, 3], normals [N, 3], and which [N] the clip shows."""
-    verts, faces = extract_mesh(surface)
-    occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
-    points, normals = sample_surface(verts, faces, _SAMPLES)
-    frames = times_seen(carving.views, points, normals, occluders, config.tolerance)
-    return points, normals, frames >= min(config.least_frames, len(carving.views.shown))
 
 
 def complete(
@@ -83,7 +66,7 @@ def complete(
     The search is a matter of seconds.
     """
     plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
-    points, normals, seen = seen_samples(carving, plain, config)
+    points, normals, seen = seen_samples(carving, plain, initial)
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
         return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")
@@ -92,7 +75,7 @@ def complete(
     measured = seen & (distance < config.measured)
     colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
     surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
-    is_empty = _empty_space(carving, surface, config)
+    is_empty = _empty_space(carving, surface, initial)
     symmetries = find_symmetries(surface, is_empty, config.symmetry)
     if not symmetries:
         return replace(nothing, why_not="no strong evidence for any")
@@ -104,15 +87,15 @@ def complete(
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 
 
-def _empty_space(carving: Carving, surface: SeenSurface, config: CompletionConfig) -> IsEmpty:
+def _empty_space(carving: Carving, surface: SeenSurface, config: InitialConfig) -> IsEmpty:
     """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
     grid = carving.hull
     corners = grid.points()
     outside = grid.values.ravel()
-    near = np.flatnonzero(outside < config.tolerance)
+    near = np.flatnonzero(outside < config.seen_tolerance)
     empty = np.ones(len(corners))
-    before = times_empty(carving.views, corners[near], surface.points, config.tolerance)
-    empty[near] = (outside[near] > _OUTSIDE * config.tolerance) | (before >= config.least_frames)
+    before = times_empty(carving.views, corners[near], surface.points, config.seen_tolerance)
+    empty[near] = (outside[near] > _OUTSIDE * config.seen_tolerance) | (before >= config.seen_frames)
     volume = empty.reshape(grid.values.shape)
 
     def is_empty(points: np.ndarray) -> np.ndarray:

@@ -38,6 +38,17 @@ class InitialConfig:
     # show object in more than this share of the frames.
     surface_margin: float = 0.002
     surface_shown: float = 0.8
+    # A part of the surface counts as seen when it shows in so many frames: fewer may be a fault of mask or
+    # pose.
+    seen_frames: int = 3
+    # Poses are wrong by about so much, metres: nearer surface does not hide, and nothing is known to be empty
+    # nearer.
+    seen_tolerance: float = 0.006
+    # Hands meet no surface further than this from any seen or measured one, metres: closing what was never
+    # seen fills a grip that a hand is in.
+    surface_solid: float = 0.015
+    # The mesh ends so far from any seen or measured surface, metres.
+    surface_kept: float = 0.03
 
 
 class HandStart(NamedTuple):

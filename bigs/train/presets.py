@@ -140,7 +140,6 @@ _JOINT = OptimizeStage(
     weights={
         "image": 4.0,
         "mse": 30.0,
-        "mask": 0.5,
         "spill": 4.0,
         "labels": 0.5,
         "silhouette": 4.0,

@@ -45,7 +45,6 @@ class Pixels(NamedTuple):
     foreground: Tensor  # [M]
     empty: Tensor  # [M] share that shows no subject, nor anything unlabelled that may hide one
     shares: Tensor  # [M, E] for the entities rendered
-    n_outside: Tensor  # [] pixels of the whole images that show nothing
 
 
 @dataclass
@@ -165,7 +164,6 @@ class Step:
             shown,
             (1.0 - shown - some(unknown)).clamp_min(0.0),
             shares,
-            (1.0 - foreground).sum(),
         )
 
     @cached_property

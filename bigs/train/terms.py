@@ -97,8 +97,8 @@ def ssim_together(step: Step) -> Tensor:
 
 
 def mask_together(step: Step) -> Tensor:
-    pixels = step.pixels
-    return outside_mask(pixels.colors[:, :3], pixels.foreground, pixels.n_outside)
+    """The paper's, sleeves and all; `spill` leaves out what they cover."""
+    return outside_mask(step.together.colors[..., :3], step.foreground)
 
 
 def spill(step: Step) -> Tensor:

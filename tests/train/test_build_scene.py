@@ -19,20 +19,25 @@ from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.raster import rasterization
 from bigs.train.build import build_scene, likely_shape
-from bigs.train.initial import initial_trajectory
+from bigs.train.initial import InitialConfig, initial_trajectory
 from bigs.train.presets import SMOKE
 from bigs.types import MASK_VALUES, SIDES, Entity, Side
 
-AS_GIVEN = replace(SMOKE.initial, smooth_hands=0.0, smooth_object=0.0)
+AS_GIVEN = replace(
+    SMOKE.initial, smooth_hands=0.0, smooth_object=0.0, surface_solid=np.inf, surface_kept=np.inf
+)
 
 
 def build(
-    clip: Clip, hands: dict[Side, HandModel], shape_error: float = SMOKE.hand.shape_error
+    clip: Clip,
+    hands: dict[Side, HandModel],
+    shape_error: float = SMOKE.hand.shape_error,
+    initial: InitialConfig = AS_GIVEN,
 ) -> tuple[Scene, list[str]]:
     torch.manual_seed(0)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     hand = replace(SMOKE.hand, shape_error=shape_error)
-    scene, skipped = build_scene(clip, nothing, hands, AS_GIVEN, hand, SMOKE.object, True)
+    scene, skipped = build_scene(clip, nothing, hands, initial, hand, SMOKE.object, True)
     return scene, skipped
 
 
@@ -133,6 +138,23 @@ def test_the_surface_is_closed_and_near_the_truth(scene: Scene, tiny_clip: Path)
     assert scene.object_distance(scene.object_surface.verts).abs().max() < 1e-3
     middle = torch.as_tensor(mesh.center_mass, dtype=torch.float32)
     assert scene.object_distance(middle[None]).item() < -0.005
+
+
+@torch.no_grad()
+def test_what_nothing_speaks_for_is_no_surface(
+    scene: Scene, tiny: Clip, both_hands: dict[Side, HandModel]
+) -> None:
+    """The mesh ends there and hands meet nothing; Gaussians stand all around as before."""
+    cut, notes = build(tiny, both_hands, initial=replace(AS_GIVEN, surface_solid=0.015, surface_kept=0.03))
+    assert len(notes) == 1
+    assert notes[0].endswith("% of the object's surface: further than 30 mm from anything seen")
+    assert torch.equal(cut.object_splats().means, scene.object_splats().means)
+    whole, kept = scene.object_surface.verts, cut.object_surface.verts
+    gone = ~(whole[:, None] == kept[None]).all(-1).any(1)
+    assert 0 < int(gone.sum()) == len(whole) - len(kept)
+    assert (cut.object_distance(whole[gone]) > 0.005).all()
+    assert (cut.object_distance(kept) >= scene.object_distance(kept)).all()
+    assert cut.object_distance(kept).abs().median() < 1e-3
 
 
 @torch.no_grad()

@@ -154,7 +154,6 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     whole = {
         "image": masked_l1(rendered[..., :3], images, foreground),
         "mse": masked_mse(rendered[..., :3], images, foreground),
-        "mask": outside_mask(rendered[..., :3], foreground),
         "spill": spilled(step.together.alphas.flatten(0, 2), 1.0 - foreground.flatten(), foreground),
         "labels": label_difference(rendered[..., 3:], labels),
     }
@@ -163,7 +162,7 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
         assert value > 0.0, name
 
 
-@pytest.mark.parametrize("name", ["image", "mse", "mask", "spill", "labels"])
+@pytest.mark.parametrize("name", ["image", "mse", "spill", "labels"])
 def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, name: str) -> None:
     """No term of single pixels pulls at what is rendered there."""
     targets = evidence.targets
@@ -177,8 +176,19 @@ def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, nam
         return IMAGE_TERMS["interacting-subjects"][name](step)
 
     assert term(covered) == 0.0
-    if name in ("mask", "spill", "labels"):
+    if name in ("spill", "labels"):
         assert term(bare) > 0.0
+
+
+def test_the_papers_mask_term_counts_what_a_sleeve_covers(scene: Scene, evidence: Evidence) -> None:
+    """Its form is (1 - m) over the whole image."""
+    targets, frames = evidence.targets, torch.tensor([0, 2])
+    covered = replace(targets, unknown=1.0 - targets.foreground)
+    step = Step(
+        scene, replace(evidence, targets=covered), scene.entities, scene.canonical(scene.entities), frames
+    )
+    expected = outside_mask(step.together.colors[..., :3], targets.foreground[frames])
+    assert IMAGE_TERMS["interacting-subjects"]["mask"](step) == expected > 0.0
 
 
 def test_skinning_and_scale_are_reached_too(scene: Scene, evidence: Evidence) -> None:

@@ -1,0 +1,63 @@
+"""What of the object's closed surface the clip speaks for: where nothing does, the closure is a guess."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.spatial
+
+from bigs.geometry.coverage import times_seen
+from bigs.geometry.mesh import sample_surface
+from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.train.carving import Carving
+from bigs.train.initial import InitialConfig
+
+# Samples of the surface that are looked at, and those that may hide them.
+_SAMPLES, _OCCLUDERS = 4000, 20_000
+
+
+class SurfaceSamples(NamedTuple):
+    """Even samples of a closed surface."""
+
+    points: np.ndarray  # [N, 3] metres
+    normals: np.ndarray  # [N, 3] unit, outward
+    seen: np.ndarray  # [N] bool: the clip shows it
+
+
+def seen_samples(carving: Carving, surface: DistanceGrid, config: InitialConfig) -> SurfaceSamples:
+    """Samples of a surface, and which of them show in enough frames."""
+    verts, faces = extract_mesh(surface)
+    occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
+    points, normals = sample_surface(verts, faces, _SAMPLES)
+    frames = times_seen(carving.views, points, normals, occluders, config.seen_tolerance)
+    return SurfaceSamples(points, normals, frames >= min(config.seen_frames, len(carving.views.shown)))
+
+
+class Support:
+    """How far places are from anything that the clip shows of the object."""
+
+    def __init__(self, samples: SurfaceSamples, points: np.ndarray) -> None:
+        """`points` [M, 3] are the clip's own, metres; at least one of them, or one seen sample."""
+        self._samples = scipy.spatial.cKDTree(samples.points)
+        self._shown = scipy.spatial.cKDTree(np.concatenate([samples.points[samples.seen], points]))
+        self._of_sample = self._shown.query(samples.points)[0]
+
+    def known_part(self, verts: np.ndarray, faces: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces of a mesh that lie within `reach` metres of what is shown."""
+        near = self._shown.query(verts)[0] < reach
+        kept = faces[near[faces].all(axis=1)]
+        used, kept = np.unique(kept, return_inverse=True)
+        return verts[used], kept.reshape(-1, 3)
+
+    def without_guesses(self, grid: DistanceGrid, reach: float) -> DistanceGrid:
+        """The signed distance without what lies behind surface further than `reach` from what is shown.
+
+        What lies deep inside an object that is shown all around stays inside.
+        """
+        corners = grid.points()
+        values = grid.values.ravel().copy()
+        guessed = self._of_sample[self._samples.query(corners, workers=-1)[1]] >= reach
+        beyond = self._shown.query(corners[guessed])[0] - reach
+        values[guessed] = np.maximum(values[guessed], beyond)
+        return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)
