@@ -14,6 +14,7 @@ from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.mesh import face_areas, sample_surface
 from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.symmetry import Symmetry
 from bigs.hand import HandModel, shared_betas
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.lighting import Lighting
@@ -21,6 +22,7 @@ from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.carving import carve, convex_surface
+from bigs.train.completion import CompletionConfig, complete
 from bigs.train.initial import (
     InitialConfig,
     ObjectStart,
@@ -38,6 +40,7 @@ class SceneStart(NamedTuple):
 
     scene: Scene
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
+    symmetries: list[Symmetry]  # of the object, where they were looked for
 
 
 def build_scene(
@@ -48,6 +51,7 @@ def build_scene(
     hand: HandSplatsConfig,
     obj: ObjectSplatsConfig,
     lighting: bool,
+    completion: CompletionConfig | None = None,
 ) -> SceneStart:
     """A scene at its start values.
 
@@ -57,6 +61,8 @@ def build_scene(
         hand_models: both sides' models in their files' own conventions.
         initial, hand, obj: see those classes.
         lighting: whether colours depend on the direction a surface faces.
+        completion: where much of the object was never seen, its symmetries tell what hands may meet there;
+            if it has none, they meet nothing there. Without it they meet the closed surface.
     """
     starts = {
         side: smooth_hand(
@@ -66,11 +72,12 @@ def build_scene(
     }
     canonical = _canonical_hands(clip, hand_models, hand)
     skipped: list[str] = []
+    symmetries: list[Symmetry] = []
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
-        surfaces = _object_surfaces(clip, unknown, start, initial)
-        skipped += surfaces.skipped
+        surfaces = _object_surfaces(clip, unknown, start, initial, completion)
+        skipped, symmetries = surfaces.skipped, surfaces.symmetries
         verts, faces = surfaces.closed
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
         verts, faces = surfaces.kept
@@ -97,7 +104,7 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
-    return SceneStart(scene, skipped)
+    return SceneStart(scene, skipped, symmetries)
 
 
 class _ObjectSurfaces(NamedTuple):
@@ -107,10 +114,15 @@ class _ObjectSurfaces(NamedTuple):
     kept: tuple[np.ndarray, np.ndarray]  # of the mesh, which ends where nothing speaks for it
     solid: DistanceGrid  # what hands touch
     skipped: list[str]
+    symmetries: list[Symmetry]
 
 
 def _object_surfaces(
-    clip: Clip, unknown: np.ndarray, start: ObjectStart, initial: InitialConfig
+    clip: Clip,
+    unknown: np.ndarray,
+    start: ObjectStart,
+    initial: InitialConfig,
+    completion: CompletionConfig | None,
 ) -> _ObjectSurfaces:
     try:
         carving = carve(clip, unknown, start, initial)
@@ -120,7 +132,7 @@ def _object_surfaces(
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid)
         why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
-        return _ObjectSurfaces(closed, closed, grid, [why])
+        return _ObjectSurfaces(closed, closed, grid, [why], [])
     support = Support(seen_samples(carving, grid, initial), carving.points)
     kept = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
@@ -128,7 +140,12 @@ def _object_surfaces(
     if left_out > 0.005:
         reach = f"{1e3 * initial.surface_kept:.0f} mm"
         skipped.append(f"{left_out:.0%} of the object's surface: further than {reach} from anything seen")
-    return _ObjectSurfaces(closed, kept, support.without_guesses(grid, initial.surface_solid), skipped)
+    symmetries: list[Symmetry] = []
+    if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
+        found = complete(carving, start, initial, completion)
+        symmetries = found.symmetries
+        grid = found.surface if symmetries else support.without_guesses(grid, initial.surface_solid)
+    return _ObjectSurfaces(closed, kept, grid, skipped, symmetries)
 
 
 def _canonical_hands(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from bigs.data.base import Clip
 from bigs.geometry.mesh import face_areas, frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.geometry.surface import extract_mesh
-from bigs.geometry.symmetry import SeenSurface, completed
+from bigs.geometry.symmetry import SeenSurface, Symmetry, completed
 from bigs.models.object_detail import ObjectDetail, replace_gaussians, split_object
 from bigs.models.object_splats import CanonicalObject, ObjectSplatsConfig
 from bigs.models.scene import ObjectSurface, Scene
@@ -48,6 +49,7 @@ def complete_scene(
     initial: InitialConfig,
     completion: CompletionConfig,
     obj: ObjectSplatsConfig,
+    earlier: Sequence[Symmetry] = (),
 ) -> CompletedScene:
     """Let the object's symmetries, if it has any, complete it where the clip never showed it; in place.
 
@@ -59,13 +61,14 @@ def complete_scene(
         clip, unknown: as the scene was built from.
         evidence: the clip at the size at which the guard looks.
         stage, initial, completion, obj: see those classes.
+        earlier: see `complete`.
     """
     scene.requires_grad_(False)
     canonical = scene.object_splats()
     start = _at_final_poses(scene, clip, evidence, initial)
     try:
         carving = carve(clip, unknown, start, initial)
-        found = complete(carving, start, initial, completion)
+        found = complete(carving, start, initial, completion, earlier)
     except (ValueError, scipy.spatial.QhullError) as reason:
         return CompletedScene(f"masks and points give no surface: {reason}", {})
     facts = {"object seen": f"{found.seen:.0%} of its surface"}

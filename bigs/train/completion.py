@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,11 +60,19 @@ _OUTSIDE = 0.67
 
 
 def complete(
-    carving: Carving, start: ObjectStart, initial: InitialConfig, config: CompletionConfig
+    carving: Carving,
+    start: ObjectStart,
+    initial: InitialConfig,
+    config: CompletionConfig,
+    earlier: Sequence[Symmetry] = (),
 ) -> Completion:
     """The object's surface; where it was never seen, by its symmetries if it has any.
 
     The search is a matter of seconds.
+
+    Args:
+        carving, start, initial, config: see those classes.
+        earlier: symmetries for which the evidence was strong before; they count if there is none now.
     """
     plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
     points, normals, seen = seen_samples(carving, plain, initial)
@@ -76,7 +85,7 @@ def complete(
     colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
     surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
     is_empty = _empty_space(carving, surface, initial)
-    symmetries = find_symmetries(surface, is_empty, config.symmetry)
+    symmetries = find_symmetries(surface, is_empty, config.symmetry) or list(earlier)
     if not symmetries:
         return replace(nothing, why_not="no strong evidence for any")
     known = SeenSurface(carving.points, carving.normals, colors[tree.query(carving.points)[1]])

@@ -91,7 +91,7 @@ def fit(
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene, skipped = build_scene(
+    scene, skipped, symmetries = build_scene(
         clip,
         unknown,
         hand_models,
@@ -99,6 +99,7 @@ def fit(
         config.hand,
         config.object,
         config.lighting,
+        config.prior.completion if any(isinstance(s, CompletionStage) for s in config.stages) else None,
     )
     report.skipped += [note for note in (network_note, prior_note) if note] + skipped
     report.seconds["start values"] = time.perf_counter() - began
@@ -144,7 +145,7 @@ def fit(
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, CompletionStage | GuidanceStage):
             if isinstance(stage, CompletionStage):
-                done = run_completion(scene, stage, sources, config)
+                done = run_completion(scene, stage, sources, config, symmetries)
             else:
                 done = run_guidance(scene, stage, index, sources, config, denoiser, continues, keep, listen)
             if done.skipped:

@@ -44,9 +44,11 @@ class InitialConfig:
     # Poses are wrong by about so much, metres: nearer surface does not hide, and nothing is known to be empty
     # nearer.
     seen_tolerance: float = 0.006
-    # Hands meet no surface further than this from any seen or measured one, metres: closing what was never
-    # seen fills a grip that a hand is in.
+    # Surface further than this from any seen or measured one is a guess, metres. Where more than this share
+    # of the surface is one, and no symmetry speaks for it, hands do not meet it: closing what was never seen
+    # fills a grip that a hand is in.
     surface_solid: float = 0.015
+    surface_guessed: float = 0.1
     # The mesh ends so far from any seen or measured surface, metres.
     surface_kept: float = 0.03
 

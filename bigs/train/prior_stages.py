@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from bigs.data.base import Clip
+from bigs.geometry.symmetry import Symmetry
 from bigs.guidance.denoiser import Denoiser
 from bigs.models.scene import Scene
 from bigs.train.completed_scene import CompletedScene, complete_scene
@@ -20,7 +21,11 @@ _OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size
 
 
 def run_completion(
-    scene: Scene, stage: CompletionStage, sources: EvidenceSource, config: RunConfig
+    scene: Scene,
+    stage: CompletionStage,
+    sources: EvidenceSource,
+    config: RunConfig,
+    earlier: Sequence[Symmetry],
 ) -> CompletedScene:
     """Complete the object by its symmetries; see `complete_scene`."""
     return complete_scene(
@@ -32,6 +37,7 @@ def run_completion(
         config.initial,
         config.prior.completion,
         config.object,
+        earlier,
     )
 
 

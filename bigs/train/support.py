@@ -43,6 +43,10 @@ class Support:
         self._shown = scipy.spatial.cKDTree(np.concatenate([samples.points[samples.seen], points]))
         self._of_sample = self._shown.query(samples.points)[0]
 
+    def guessed(self, reach: float) -> float:
+        """The share of the surface that lies further than `reach` metres from what is shown."""
+        return float((self._of_sample >= reach).mean())
+
     def known_part(self, verts: np.ndarray, faces: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces of a mesh that lie within `reach` metres of what is shown."""
         near = self._shown.query(verts)[0] < reach

@@ -7,16 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from limited_view import bottle_clip, limited_view
 
 from bigs.data.base import Clip
+from bigs.geometry.distance import DistanceField
 from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
+from bigs.train.build import build_scene
 from bigs.train.carving import Carving, carve
 from bigs.train.completion import Completion, CompletionConfig, complete
 from bigs.train.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
+from bigs.train.presets import SMOKE
 from bigs.types import HandObjectTrajectory, Side
 
 INITIAL = InitialConfig(surface_resolution=56)
@@ -57,6 +61,37 @@ def test_the_unseen_side_comes_nearer_to_the_truth(
     after = score(found.surface, bottle[1])
     assert after.chamfer.squared < 0.8 * before.chamfer.squared
     assert after.f5 > before.f5 and after.f10 >= before.f10
+
+
+def test_hands_meet_the_far_side_that_symmetry_tells(
+    one_side: tuple[Clip, Carving, ObjectStart], both_hands: dict[Side, HandModel]
+) -> None:
+    clip, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig())
+    built = build_scene(
+        clip,
+        nothing_hides(clip),
+        both_hands,
+        INITIAL,
+        SMOKE.hand,
+        SMOKE.object,
+        False,
+        CompletionConfig(),
+    )
+    assert len(built.symmetries) == len(found.symmetries) > 0
+    assert torch.equal(built.scene.object_distance.values, DistanceField(found.surface).values)
+
+
+def test_symmetries_found_earlier_count_if_there_are_none_now(
+    one_side: tuple[Clip, Carving, ObjectStart],
+) -> None:
+    _, carving, start = one_side
+    base = CompletionConfig()
+    found = complete(carving, start, INITIAL, base)
+    strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
+    again = complete(carving, start, INITIAL, strict, found.symmetries)
+    assert again.symmetries == found.symmetries
+    np.testing.assert_array_equal(again.surface.values, found.surface.values)
 
 
 def test_weak_evidence_changes_nothing(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
