@@ -22,7 +22,7 @@ from bigs.geometry.surface import DistanceGrid, inlier_points
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
 from bigs.preprocess.hands import posed_track
-from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.object_surface import RoughSurface, SurfaceConfig, rough_surface, visual_hull
 from bigs.types import Side
 
 
@@ -35,6 +35,10 @@ class AlignConfig:
     span: float = 0.3
     sizes: int = 13
     finer: int = 7
+    # Cost, in touching frames, of a size that is off the first guess by a share of `size_sigma`; grows with
+    # the square. It decides where contact tells nothing.
+    size_prior: float = 0.02
+    size_sigma: float = 0.05
     # Shifts along the ray tried in every frame, as a share of the hand's depth.
     reach: float = 0.1
     shifts: int = 41
@@ -106,7 +110,7 @@ def align(
     points = guess * sfm.points
     points = points[inlier_points(points)]
     hull = visual_hull(points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface)
-    grid = rough_surface(points, hull, config.surface)
+    surface = rough_surface(points, hull, config.surface)
     factors = np.exp(np.linspace(-config.span, config.span, config.sizes))
     frames = sum(int(t.sum()) for t in touching.values())
     if frames == 0:
@@ -122,14 +126,14 @@ def align(
 
     def attempt(factor: float) -> tuple[float, dict[Side, np.ndarray]]:
         """The mean cost of a touching frame at that size, and each hand's shifts [T]."""
-        cost, shifts = 0.0, {}
+        cost, shifts = config.size_prior * (np.log(factor) / config.size_sigma) ** 2, {}
         for side, points in verts.items():
             table, tried = contact_costs(
                 points[:, :: config.every],
                 rays[side],
                 touching[side],
                 (sfm.rotations, guess * sfm.transl),
-                grid,
+                surface,
                 factor,
                 config,
             )
@@ -184,7 +188,7 @@ def contact_costs(
     rays: np.ndarray,
     touching: np.ndarray,
     poses: tuple[np.ndarray, np.ndarray],
-    grid: DistanceGrid,
+    surface: RoughSurface,
     factor: float,
     config: AlignConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +199,7 @@ def contact_costs(
         rays: [T, 3] unit.
         touching: [T] bool; the other frames only have the prior.
         poses: rotations [T, 3, 3] and translations [T, 3] of the object at factor 1.
-        grid: the object's surface at factor 1, in its own frame.
+        surface: the object's at factor 1, in its own frame.
         factor: on size and depth together.
         config: see there.
 
@@ -213,9 +217,12 @@ def contact_costs(
         at = (verts[t] @ rotations[t]) / factor - transl[t] @ rotations[t]
         along = rays[t] @ rotations[t] / factor
         places = at + shifts[t][:, None, None] * along
-        distance = factor * sample_grid(grid, places.reshape(-1, 3)).reshape(places.shape[:2])
-        near = np.partition(distance, count - 1, axis=1)[:, :count].clip(0.0)
-        deep = (-distance - config.depth).clip(0.0, 0.02) / config.saturation
+        outside, inside = (
+            factor * sample_grid(grid, places.reshape(-1, 3)).reshape(places.shape[:2])
+            for grid in (surface.outer, surface.solid)
+        )
+        near = np.partition(outside, count - 1, axis=1)[:, :count].clip(0.0)
+        deep = (-inside - config.depth).clip(0.0, 0.02) / config.saturation
         costs[t] += (near / (near + config.saturation)).mean(1) + config.penetration * deep.mean(1)
     return costs, shifts
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,7 @@ class SurfaceConfig:
     agreeing: int = 3  # of them must agree before a place is carved away
     reach: float = 0.016  # at this distance from the nearest point the hull alone decides
     margin: float = 0.01  # how far the surface may leave the points' convex hull
+    possible: float = 0.001  # a hand counts as this far off where object is possible but not known
 
 
 def visual_hull(
@@ -57,13 +59,25 @@ def visual_hull(
     )
 
 
-def rough_surface(points: np.ndarray, hull: VisualHull, config: SurfaceConfig) -> DistanceGrid:
+class RoughSurface(NamedTuple):
+    """Signed distances to the object, where it is known and where it is not."""
+
+    solid: DistanceGrid  # what a hand cannot be in
+    # What a hand touches. Between the solid and the visual hull, where a hand hid the background in every
+    # frame, there may be object (a grip, say) or not: `SurfaceConfig.possible`, so that known surface is better.
+    outer: DistanceGrid
+
+
+def rough_surface(points: np.ndarray, hull: VisualHull, config: SurfaceConfig) -> RoughSurface:
     """The visual hull blended with the planes of points [N, 3], cut back to near their convex hull."""
     size = float((points.max(0) - points.min(0)).max())
     grid = empty_grid(points.min(0) - 0.15 * size, points.max(0) + 0.15 * size, config.resolution)
     corners = grid.points()
     bound = convex_distance(corners, points) - config.margin
-    distance = np.maximum(hull.distance(corners, stop=config.reach), bound)
+    to_hull = hull.distance(corners, stop=config.reach)
+    distance = np.maximum(to_hull, bound)
     carved = DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
     normals = point_normals(points, hull.outward(points, 0.5 * grid.spacing))
-    return blend_with_points(carved, points, normals, config.reach)
+    solid = blend_with_points(carved, points, normals, config.reach)
+    outer = np.minimum(solid.values, to_hull.reshape(grid.values.shape).clip(0.0) + config.possible)
+    return RoughSurface(solid, DistanceGrid(outer, grid.origin, grid.spacing))

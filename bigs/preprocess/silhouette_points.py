@@ -67,7 +67,7 @@ def complete_points(
     core = points[inside & inlier_points(points)]
     if len(core) < _FEWEST_POINTS:
         return sfm
-    surface = rough_surface(core, hull, config.surface)
+    surface = rough_surface(core, hull, config.surface).solid
     if not (surface.values < 0).any():
         return sfm
     usable = np.flatnonzero(sfm.confidence > 0) if (sfm.confidence > 0).any() else np.arange(len(masks))

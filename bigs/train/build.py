@@ -13,6 +13,7 @@ from torch import Tensor
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.mesh import face_areas, sample_surface
+from bigs.geometry.support import Support, seen_samples
 from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.geometry.symmetry import Symmetry
 from bigs.hand import HandModel, shared_betas
@@ -31,7 +32,6 @@ from bigs.train.initial import (
     smooth_hand,
     smooth_object,
 )
-from bigs.train.support import Support, seen_samples
 from bigs.types import Side
 
 
@@ -133,7 +133,9 @@ def _object_surfaces(
         closed = extract_mesh(grid)
         why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
         return _ObjectSurfaces(closed, closed, grid, [why], [])
-    support = Support(seen_samples(carving, grid, initial), carving.points)
+    support = Support(
+        seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
+    )
     kept = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
     skipped = []

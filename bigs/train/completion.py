@@ -10,12 +10,12 @@ import scipy.ndimage
 import scipy.spatial
 
 from bigs.geometry.coverage import times_empty
+from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid
 from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
 from bigs.train.carving import Carving
 from bigs.train.initial import InitialConfig, ObjectStart
-from bigs.train.support import seen_samples
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def complete(
         earlier: symmetries for which the evidence was strong before; they count if there is none now.
     """
     plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
-    points, normals, seen = seen_samples(carving, plain, initial)
+    points, normals, seen = seen_samples(carving.views, plain, initial.seen_frames, initial.seen_tolerance)
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
         return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
@@ -78,7 +79,7 @@ def test_true_hands_give_the_true_size_and_stay(truth: Truth) -> None:
     assert found.scale == pytest.approx(UNIT, rel=0.03)
     assert all(touching.any() for touching in report.touching.values())
     for side, track in truth.hands.items():
-        assert np.abs(found.hand_transl[side] - track.transl).max() < 0.012
+        assert np.abs(found.hand_transl[side] - track.transl).max() < 0.05
     np.testing.assert_allclose(found.object_transl, found.scale * truth.sfm.transl)
 
 
@@ -93,6 +94,21 @@ def test_hands_at_wrong_depths_are_brought_to_the_object(truth: Truth) -> None:
         before = np.linalg.norm(hands[side].transl - track.transl, axis=1)
         after = np.linalg.norm(found.hand_transl[side] / size - track.transl, axis=1)
         assert after.mean() < 0.7 * before.mean()
+
+
+def test_a_grip_that_a_hand_always_hides_may_be_there(truth: Truth) -> None:
+    """No point was measured near a hand: the hands must not look for contact with what is left."""
+    points = UNIT * truth.sfm.points
+    hidden = np.zeros(len(points), dtype=bool)
+    for side, track in truth.hands.items():
+        verts = posed_vertices(track, truth.models[side])
+        for t in range(FRAMES):
+            own = (verts[t] - UNIT * truth.sfm.transl[t]) @ truth.sfm.rotations[t]
+            hidden |= cKDTree(own).query(points)[0] < 0.025
+    assert 0.2 < hidden.mean() < 0.8
+    sfm = replace(truth.sfm, points=truth.sfm.points[~hidden], colors=truth.sfm.colors[~hidden])
+    found, _ = align(truth.hands, sfm, truth.masks, truth.K, truth.models, AlignConfig())
+    assert found.scale == pytest.approx(UNIT, rel=0.05)
 
 
 def test_hands_whose_depth_is_known_well_are_left_there(truth: Truth) -> None:

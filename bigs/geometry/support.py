@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.spatial
 
-from bigs.geometry.coverage import times_seen
+from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.geometry.mesh import sample_surface
 from bigs.geometry.surface import DistanceGrid, extract_mesh
-from bigs.train.carving import Carving
-from bigs.train.initial import InitialConfig
 
 # Samples of the surface that are looked at, and those that may hide them.
 _SAMPLES, _OCCLUDERS = 4000, 20_000
@@ -25,13 +23,25 @@ class SurfaceSamples(NamedTuple):
     seen: np.ndarray  # [N] bool: the clip shows it
 
 
-def seen_samples(carving: Carving, surface: DistanceGrid, config: InitialConfig) -> SurfaceSamples:
-    """Samples of a surface, and which of them show in enough frames."""
+def seen_samples(
+    views: ObjectViews, surface: DistanceGrid, least_frames: int, tolerance: float
+) -> SurfaceSamples:
+    """Samples of a surface, and which of them show in enough frames.
+
+    Args:
+        views: the frames that count.
+        surface: signed distances.
+        least_frames: frames that must show a sample, or all if there are fewer.
+        tolerance: metres by which poses are wrong; surface that is nearer by less does not hide.
+
+    Raises:
+        ValueError: there is no surface.
+    """
     verts, faces = extract_mesh(surface)
     occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
     points, normals = sample_surface(verts, faces, _SAMPLES)
-    frames = times_seen(carving.views, points, normals, occluders, config.seen_tolerance)
-    return SurfaceSamples(points, normals, frames >= min(config.seen_frames, len(carving.views.shown)))
+    frames = times_seen(views, points, normals, occluders, tolerance)
+    return SurfaceSamples(points, normals, frames >= min(least_frames, len(views.shown)))
 
 
 class Support:

@@ -7,8 +7,8 @@ import pytest
 import scipy.spatial
 
 from bigs.geometry.mesh import sample_surface
+from bigs.geometry.support import Support, SurfaceSamples
 from bigs.geometry.surface import DistanceGrid, empty_grid, extract_mesh
-from bigs.train.support import Support, SurfaceSamples
 
 RADIUS = 0.05
 NOTHING = np.empty((0, 3))
