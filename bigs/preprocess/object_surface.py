@@ -64,7 +64,8 @@ class RoughSurface(NamedTuple):
 
     solid: DistanceGrid  # what a hand cannot be in
     # What a hand touches. Between the solid and the visual hull, where a hand hid the background in every
-    # frame, there may be object (a grip, say) or not: `SurfaceConfig.possible`, so that known surface is better.
+    # frame, there may be object (a grip, say) or not: `SurfaceConfig.possible`, so that what is known counts
+    # for more.
     outer: DistanceGrid
 
 

@@ -34,6 +34,9 @@ from bigs.train.initial import (
 )
 from bigs.types import Side
 
+# The fact that the mesh ends where nothing speaks for it.
+OPEN_MESH = "object mesh"
+
 
 class SceneStart(NamedTuple):
     """A scene at its start values, and what there is to say about them."""
@@ -41,6 +44,7 @@ class SceneStart(NamedTuple):
     scene: Scene
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
     symmetries: list[Symmetry]  # of the object, where they were looked for
+    facts: dict[str, str]  # what else there is to tell
 
 
 def build_scene(
@@ -73,11 +77,12 @@ def build_scene(
     canonical = _canonical_hands(clip, hand_models, hand)
     skipped: list[str] = []
     symmetries: list[Symmetry] = []
+    facts: dict[str, str] = {}
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
         surfaces = _object_surfaces(clip, unknown, start, initial, completion)
-        skipped, symmetries = surfaces.skipped, surfaces.symmetries
+        skipped, symmetries, facts = surfaces.skipped, surfaces.symmetries, surfaces.facts
         verts, faces = surfaces.closed
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
         verts, faces = surfaces.kept
@@ -104,7 +109,7 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
-    return SceneStart(scene, skipped, symmetries)
+    return SceneStart(scene, skipped, symmetries, facts)
 
 
 class _ObjectSurfaces(NamedTuple):
@@ -115,6 +120,7 @@ class _ObjectSurfaces(NamedTuple):
     solid: DistanceGrid  # what hands touch
     skipped: list[str]
     symmetries: list[Symmetry]
+    facts: dict[str, str]
 
 
 def _object_surfaces(
@@ -132,22 +138,22 @@ def _object_surfaces(
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid)
         why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
-        return _ObjectSurfaces(closed, closed, grid, [why], [])
+        return _ObjectSurfaces(closed, closed, grid, [why], [], {})
     support = Support(
         seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
     )
     kept = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
-    skipped = []
+    facts = {}
     if left_out > 0.005:
         reach = f"{1e3 * initial.surface_kept:.0f} mm"
-        skipped.append(f"{left_out:.0%} of the object's surface: further than {reach} from anything seen")
+        facts[OPEN_MESH] = f"open: {left_out:.0%} of it would be further than {reach} from anything seen"
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
         found = complete(carving, start, initial, completion)
         symmetries = found.symmetries
         grid = found.surface if symmetries else support.without_guesses(grid, initial.surface_solid)
-    return _ObjectSurfaces(closed, kept, grid, skipped, symmetries)
+    return _ObjectSurfaces(closed, kept, grid, [], symmetries, facts)
 
 
 def _canonical_hands(

@@ -21,7 +21,7 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
-from bigs.train.build import build_scene
+from bigs.train.build import OPEN_MESH, build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import (
     CompletionStage,
@@ -91,7 +91,7 @@ def fit(
     torch.manual_seed(config.seed)
     began = time.perf_counter()
     unknown = unknown_occluders(clip)
-    scene, skipped, symmetries = build_scene(
+    start = build_scene(
         clip,
         unknown,
         hand_models,
@@ -101,7 +101,9 @@ def fit(
         config.lighting,
         config.prior.completion if any(isinstance(s, CompletionStage) for s in config.stages) else None,
     )
-    report.skipped += [note for note in (network_note, prior_note) if note] + skipped
+    scene = start.scene
+    report.skipped += [note for note in (network_note, prior_note) if note] + start.skipped
+    report.facts |= start.facts
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual, denoiser)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
@@ -145,12 +147,14 @@ def fit(
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, CompletionStage | GuidanceStage):
             if isinstance(stage, CompletionStage):
-                done = run_completion(scene, stage, sources, config, symmetries)
+                done = run_completion(scene, stage, sources, config, start.symmetries)
             else:
                 done = run_guidance(scene, stage, index, sources, config, denoiser, continues, keep, listen)
             if done.skipped:
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
+            if "object completed" in done.facts:
+                report.facts.pop(OPEN_MESH, None)
         else:
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
             if last.step < stage.steps:

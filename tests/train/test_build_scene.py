@@ -39,8 +39,8 @@ def build(
     torch.manual_seed(0)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     hand = replace(SMOKE.hand, shape_error=shape_error)
-    scene, skipped, _ = build_scene(clip, nothing, hands, initial, hand, SMOKE.object, True, completion)
-    return scene, skipped
+    built = build_scene(clip, nothing, hands, initial, hand, SMOKE.object, True, completion)
+    return built.scene, built.skipped + list(built.facts.values())
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_where_nothing_speaks_for_a_surface(
     for completion in (None, CompletionConfig(enough=0.0)):  # which finds nothing
         cut, notes = build(tiny, both_hands, initial=doubtful, completion=completion)
         assert len(notes) == 1
-        assert notes[0].endswith("% of the object's surface: further than 30 mm from anything seen")
+        assert notes[0].endswith("% of it would be further than 30 mm from anything seen")
         assert torch.equal(cut.object_splats().means, scene.object_splats().means)
         whole, kept = scene.object_surface.verts, cut.object_surface.verts
         gone = ~(whole[:, None] == kept[None]).all(-1).any(1)
