@@ -137,8 +137,7 @@ def windows_of_turn(rotations: np.ndarray, count: int) -> Iterator[np.ndarray]:
     A stretch in which the object rests looks like its mirror image in depth, so a pause makes it longer.
     """
     steps = _step_angles(rotations)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    turning = np.flatnonzero(np.append(True, steps > _REST * usual))
+    turning = np.flatnonzero(np.append(True, steps > _REST * np.median(steps)))
     half = max(count // 2, 1)
     for first in range(0, max(len(turning) - half, 1), half):
         end = turning[first + count] if first + count < len(turning) else len(rotations)
