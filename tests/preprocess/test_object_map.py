@@ -229,4 +229,4 @@ def test_a_pause_makes_the_stretches_longer_that_are_compared_with_their_mirror_
 
 
 def _turned(degrees: np.ndarray) -> np.ndarray:
-    return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    return Rotation.from_rotvec(np.radians(degrees)[:, None] * (0, 1, 0)).as_matrix()
