@@ -34,8 +34,12 @@ from bigs.train.initial import (
 )
 from bigs.types import Side
 
-# The fact that the mesh ends where nothing speaks for it.
-OPEN_MESH = "object mesh"
+
+class KnownPart(NamedTuple):
+    """The object's surface without what nothing speaks for."""
+
+    surface: ObjectSurface
+    left_out: float  # share of the closed surface's area
 
 
 class SceneStart(NamedTuple):
@@ -44,7 +48,7 @@ class SceneStart(NamedTuple):
     scene: Scene
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
     symmetries: list[Symmetry]  # of the object, where they were looked for
-    facts: dict[str, str]  # what else there is to tell
+    known: KnownPart | None  # of the object's surface, if that is not all
 
 
 def build_scene(
@@ -77,21 +81,18 @@ def build_scene(
     canonical = _canonical_hands(clip, hand_models, hand)
     skipped: list[str] = []
     symmetries: list[Symmetry] = []
-    facts: dict[str, str] = {}
+    known = None
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
         surfaces = _object_surfaces(clip, unknown, start, initial, completion)
-        skipped, symmetries, facts = surfaces.skipped, surfaces.symmetries, surfaces.facts
+        skipped, symmetries, known = surfaces.skipped, surfaces.symmetries, surfaces.known
         verts, faces = surfaces.closed
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
-        verts, faces = surfaces.kept
         object_parts = {
             "object_splats": ObjectSplats(points, normals, _nearest_colors(points, start), obj),
             "object_poses": ObjectPoses(start.rotations, start.centers),
-            "object_surface": ObjectSurface(
-                torch.as_tensor(verts, dtype=torch.float32), torch.as_tensor(faces.copy())
-            ),
+            "object_surface": _as_surface(verts, faces),
             "object_distance": DistanceField(surfaces.solid),
         }
     n_frames = len(clip)
@@ -109,18 +110,25 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
-    return SceneStart(scene, skipped, symmetries, facts)
+    return SceneStart(scene, skipped, symmetries, known)
+
+
+# A mesh that would lose less of its area is left closed.
+_LITTLE = 0.005
+
+
+def _as_surface(verts: np.ndarray, faces: np.ndarray) -> ObjectSurface:
+    return ObjectSurface(torch.as_tensor(verts, dtype=torch.float32), torch.as_tensor(faces.copy()))
 
 
 class _ObjectSurfaces(NamedTuple):
     """The object's surface, for each use."""
 
-    closed: tuple[np.ndarray, np.ndarray]  # vertices and faces; Gaussians start on it
-    kept: tuple[np.ndarray, np.ndarray]  # of the mesh, which ends where nothing speaks for it
+    closed: tuple[np.ndarray, np.ndarray]  # vertices and faces
+    known: KnownPart | None
     solid: DistanceGrid  # what hands touch
-    skipped: list[str]
     symmetries: list[Symmetry]
-    facts: dict[str, str]
+    skipped: list[str]
 
 
 def _object_surfaces(
@@ -138,22 +146,19 @@ def _object_surfaces(
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid)
         why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
-        return _ObjectSurfaces(closed, closed, grid, [why], [], {})
+        return _ObjectSurfaces(closed, None, grid, [], [why])
     support = Support(
         seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
     )
     kept = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
-    facts = {}
-    if left_out > 0.005:
-        reach = f"{1e3 * initial.surface_kept:.0f} mm"
-        facts[OPEN_MESH] = f"open: {left_out:.0%} of it would be further than {reach} from anything seen"
+    known = KnownPart(_as_surface(*kept), left_out) if left_out > _LITTLE else None
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
         found = complete(carving, start, initial, completion)
         symmetries = found.symmetries
         grid = found.surface if symmetries else support.without_guesses(grid, initial.surface_solid)
-    return _ObjectSurfaces(closed, kept, grid, [], symmetries, facts)
+    return _ObjectSurfaces(closed, known, grid, symmetries, [])
 
 
 def _canonical_hands(

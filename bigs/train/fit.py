@@ -21,7 +21,7 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.train.background import unknown_occluders
-from bigs.train.build import OPEN_MESH, build_scene
+from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.config import (
     CompletionStage,
@@ -103,7 +103,6 @@ def fit(
     )
     scene = start.scene
     report.skipped += [note for note in (network_note, prior_note) if note] + start.skipped
-    report.facts |= start.facts
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual, denoiser)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
@@ -153,8 +152,6 @@ def fit(
             if done.skipped:
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
-            if "object completed" in done.facts:
-                report.facts.pop(OPEN_MESH, None)
         else:
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
             if last.step < stage.steps:
@@ -163,6 +160,12 @@ def fit(
                 )
         keep(index + 1, None)
     scene.requires_grad_(False)
+    if start.known and not {"object completed", "prior"} & report.facts.keys():
+        scene.replace_surface(start.known.surface)
+        report.facts["object mesh"] = (
+            f"open: {start.known.left_out:.0%} of it would be further than "
+            f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
+        )
     return scene, report
 
 

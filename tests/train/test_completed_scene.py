@@ -16,7 +16,6 @@ from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
 from bigs.models.scene import Scene
-from bigs.train.build import OPEN_MESH
 from bigs.train.completion import CompletionConfig
 from bigs.train.config import CompletionStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.evidence import EvidenceSource
@@ -73,7 +72,7 @@ def shape(scene: Scene, truth: HandObjectTrajectory) -> ShapeScore:
 
 def test_off_there_is_no_such_stage(plain: tuple[Scene, FitReport]) -> None:
     assert CompletionStage().name not in plain[1].seconds
-    assert plain[1].skipped == [] and set(plain[1].facts) == {OPEN_MESH}
+    assert plain[1].skipped == [] and set(plain[1].facts) == {"object mesh"}
 
 
 def test_the_shape_gains_and_nothing_that_was_seen_changes(
@@ -83,7 +82,7 @@ def test_the_shape_gains_and_nothing_that_was_seen_changes(
 ) -> None:
     before, after = plain[0].state_dict(), completed[0].state_dict()
     assert "found" in completed[1].facts["object completed"]
-    assert "%" in completed[1].facts["object seen"] and OPEN_MESH not in completed[1].facts
+    assert "%" in completed[1].facts["object seen"] and "object mesh" not in completed[1].facts
     assert same(before, after, ("hand_poses", "object_poses", "betas", "grasps", "hand_splats", "lighting"))
     scores = [shape(scene, bottle[1]) for scene in (plain[0], completed[0])]
     assert scores[1].chamfer.squared < 0.8 * scores[0].chamfer.squared
