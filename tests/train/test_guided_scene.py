@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +53,9 @@ def test_the_unseen_part_moves_and_its_surface_follows(
     one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
 ) -> None:
     free = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, damage=1e9)))
-    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+    closed = replace(PLAN.initial, surface_kept=math.inf)
+    alone = replace(PLAN, stages=(SplitStage(parts=1),), initial=closed)
+    before, _ = run(one_side, both_hands, alone, None)
     after, report = run(one_side, both_hands, free, prior)
     assert report.skipped == []
     assert "moved what was not seen by" in report.facts["prior"]
