@@ -6,7 +6,7 @@ a third of a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class CheckConfig:
     mirror_share: float = 0.975
     # A partial model's turns that differ from the map's by more than this, degrees.
     most_disagreement: float = 5.0
-    # Steps that turn, whose frames are compared with their mirror image together.
+    # Frames that are compared with their mirror image together, half of them with the next ones too.
     mirror_window: int = 20
 
 
@@ -131,32 +131,18 @@ def _step_angles(rotations: np.ndarray) -> np.ndarray:
     return np.degrees(steps.magnitude())
 
 
-def windows_of_turn(rotations: np.ndarray, count: int) -> Iterator[np.ndarray]:
-    """Stretches of consecutive frames with `count` steps that turn, half of them shared with the next one.
-
-    A stretch in which the object rests looks like its mirror image in depth, so a pause makes it longer.
-    """
-    steps = _step_angles(rotations)
-    turning = np.flatnonzero(np.append(True, steps > _REST * np.median(steps)))
-    half = max(count // 2, 1)
-    for first in range(0, max(len(turning) - half, 1), half):
-        end = turning[first + count] if first + count < len(turning) else len(rotations)
-        inside = np.arange(turning[first], end)
-        if len(inside) >= 3:
-            yield inside
-
-
-# A step that turns by less than this share of the median one is rest.
-_REST = 0.1
-
-
 def _mirror_ratios(
     map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, window: int
 ) -> np.ndarray:
     """For each frame, the largest over windows of own misfit over the mirror image's."""
-    ratios = np.zeros(len(map_.posed))
+    frames = len(map_.posed)
+    ratios = np.zeros(frames)
     trial = ObjectMap(features, tracks, map_.K, MapConfig())
-    for inside in windows_of_turn(map_.rotations, window):
+    starts = range(0, max(frames - window // 2, 1), max(window // 2, 1))
+    for start in starts:
+        inside = np.arange(start, min(start + window, frames))
+        if len(inside) < 3:
+            continue
         trial.rotations[:], trial.transl[:] = map_.rotations, map_.transl
         own, mirrored = mirror_misfits(trial, inside)
         if np.isfinite(own) and np.isfinite(mirrored) and mirrored > 0:

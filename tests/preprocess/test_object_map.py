@@ -17,7 +17,6 @@ from bigs.preprocess.sfm_checks import (
     CheckConfig,
     check_map,
     turn_cosines,
-    windows_of_turn,
 )
 from bigs.preprocess.sfm_grow import GrowConfig, grow
 from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, splices
@@ -215,18 +214,3 @@ def test_a_turn_that_goes_back_is_a_warning_and_no_more() -> None:
     assert cosine[14] < 0.0 and cosine[:8].min() > 0.99
     still = np.tile(np.eye(3), (20, 1, 1))
     assert (turn_cosines(still) == 1.0).all()
-
-
-def test_a_pause_makes_the_stretches_longer_that_are_compared_with_their_mirror_image() -> None:
-    turn = 4.0 * np.arange(50.0)
-    even = [w.tolist() for w in windows_of_turn(_turned(turn), 20)]
-    assert even == [list(range(first, min(first + 20, 50))) for first in (0, 10, 20, 30)]
-    rest = 0.1 * np.sin(np.arange(12.0))
-    paused = np.concatenate([turn[:25], turn[24] + rest, turn[25:]])
-    for window in windows_of_turn(_turned(paused), 20):
-        assert np.ptp(paused[window]) >= 4.0 * 18
-    assert [w.tolist() for w in windows_of_turn(_turned(np.zeros(5)), 20)] == [[0, 1, 2, 3, 4]]
-
-
-def _turned(degrees: np.ndarray) -> np.ndarray:
-    return Rotation.from_rotvec(np.radians(degrees)[:, None] * (0, 1, 0)).as_matrix()
