@@ -18,6 +18,7 @@ from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices, sample_grid
 from bigs.preprocess.artefacts import ObjectSfm
+from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
 from bigs.types import Side
 
 FRAMES = 12
@@ -109,6 +110,32 @@ def test_a_grip_that_a_hand_always_hides_may_be_there(truth: Truth) -> None:
     sfm = replace(truth.sfm, points=truth.sfm.points[~hidden], colors=truth.sfm.colors[~hidden])
     found, _ = align(truth.hands, sfm, truth.masks, truth.K, truth.models, AlignConfig())
     assert found.scale == pytest.approx(UNIT, rel=0.05)
+
+
+def test_sizes_off_the_first_guess_cost_what_they_are_told_to(truth: Truth) -> None:
+    costs = {}
+    for prior in (0.0, 0.02):
+        config = AlignConfig(size_prior=prior, finer=0)
+        _, report = align(truth.hands, truth.sfm, truth.masks, truth.K, truth.models, config)
+        costs[prior] = report.costs
+    expected = 0.02 * (np.log(report.factors) / AlignConfig().size_sigma) ** 2
+    np.testing.assert_allclose(costs[0.02] - costs[0.0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("possible", [0.001, 0.004])
+def test_between_points_and_visual_hull_there_may_be_object(truth: Truth, possible: float) -> None:
+    points = UNIT * truth.sfm.points
+    config = SurfaceConfig(possible=possible)
+    poses = (truth.sfm.rotations, UNIT * truth.sfm.transl)
+    hull = visual_hull(points, *poses, truth.sfm.confidence, truth.masks, truth.K, config)
+    solid, outer = rough_surface(points[points[:, 2] > np.median(points[:, 2])], hull, config)
+    known, met = solid.values.ravel(), outer.values.ravel()
+    inside = hull.distance(solid.points()) <= 0.0
+    unknown = inside & (known > possible)
+    assert unknown.sum() > 100
+    np.testing.assert_allclose(met[unknown], possible)
+    np.testing.assert_array_equal(met[inside & ~unknown], known[inside & ~unknown])
+    assert (met <= known).all()
 
 
 def test_hands_whose_depth_is_known_well_are_left_there(truth: Truth) -> None:

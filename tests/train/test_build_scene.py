@@ -163,6 +163,9 @@ def test_where_nothing_speaks_for_a_surface(
             assert (field(whole[gone]) > 0.005).all()
             assert (field(kept) >= scene.object_distance(kept)).all()
             assert field(kept).abs().median() < 1e-3
+    enough = replace(doubtful, surface_guessed=1.0)
+    cut = build(tiny, both_hands, initial=enough, completion=CompletionConfig(enough=0.0))
+    assert torch.equal(cut.scene.object_distance.values, scene.object_distance.values)
 
 
 @torch.no_grad()

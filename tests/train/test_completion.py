@@ -12,6 +12,7 @@ from limited_view import bottle_clip, limited_view
 
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
+from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
@@ -92,6 +93,16 @@ def test_symmetries_found_earlier_count_if_there_are_none_now(
     again = complete(carving, start, INITIAL, strict, found.symmetries)
     assert again.symmetries == found.symmetries
     np.testing.assert_array_equal(again.surface.values, found.surface.values)
+
+
+def test_less_counts_as_seen_the_more_frames_must_show_it(
+    one_side: tuple[Clip, Carving, ObjectStart],
+) -> None:
+    _, carving, _ = one_side
+    surface = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
+    shares = [seen_samples(carving.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
+    assert shares[0] > shares[1] > shares[2] > 0.0
+    assert seen_samples(carving.views, surface, 3, 0.0).seen.mean() < shares[1]
 
 
 def test_weak_evidence_changes_nothing(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
