@@ -32,6 +32,8 @@ class OptimizeStage:
     frames_per_step: int = 0
     # Only the frames in which a hand holds nothing, each hand's own; those of its grasps stay as they are.
     free_frames: bool = False
+    # A frame that a step does not look at keeps its turns and fingers, and their moments in the optimiser.
+    frame_moments: bool = False
     # Learning rates fall along a cosine to this share.
     final_lr: float = 0.1
     # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.

@@ -120,7 +120,7 @@ def run_stage(
         raise InputError(f"stage {stage.name}: expected terms out of {accepted}, found {unknown[0]!r}")
     if "perceptual" in stage.weights and evidence.perceptual is None:
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
-    optimizer = make_optimizer(scene, stage.lrs)
+    optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)
     state = StageState.begun(0, optimizer)
     if resume is not None:
         optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
@@ -143,12 +143,13 @@ def run_stage(
     while state.step < stage.steps and not _has_settled(stage, state):
         began = time.perf_counter()
         moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
+        frames = choose_frames(scene.n_frames, stage, seed, state.step)
         step = Step(
             scene,
             evidence,
             entities if needs_canonical else (),
             {**fixed, **scene.canonical(moving)},
-            choose_frames(scene.n_frames, stage, seed, state.step),
+            frames,
             "labels" in stage.weights,
             seed * 1_000_003 + state.step,
             stage.free_frames,
@@ -170,7 +171,7 @@ def run_stage(
             continue
         progress = state.step / max(stage.steps, 1)
         set_cosine_rates(optimizer, progress, stage.final_lr, 0.5**state.retreats)
-        optimizer.step()
+        optimizer.step_frames(frames)
         state = _advance(stage, state, float(loss.detach()))
         if state.step % keep_every == 0:
             kept = _Kept(state)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from bigs.checks import InputError
 from bigs.models.scene import Scene
@@ -26,6 +26,9 @@ GROUPS = (
     "scene.light",
     "scene.shade",
 )
+# One row for each frame. A step that does not look at a frame says nothing about its turns and fingers; rays
+# and depths gain from what momentum and the priors over time do between a frame's own steps.
+_ROW_PER_FRAME = ("hand.orient", "hand.pose", "object.orient")
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1])),
     "object": tuple(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL)),
@@ -78,8 +81,39 @@ def _parameters(owner: nn.Module | nn.Parameter) -> Iterable[nn.Parameter]:
     return [owner] if isinstance(owner, nn.Parameter) else owner.parameters()
 
 
-def make_optimizer(scene: Scene, lrs: Mapping[str, float]) -> torch.optim.Adam:
+class FrameAdam(torch.optim.Adam):
+    """Adam in whose groups marked `per_frame` a frame that is not in the step keeps its values and moments.
+
+    Plain Adam moves it on by its momentum, and by what the terms over the whole clip say of it alone.
+    """
+
+    @torch.no_grad()
+    def step_frames(self, frames: Tensor) -> None:
+        """One step that looked at `frames` [B] of the clip."""
+        kept = []
+        for group in self.param_groups:
+            for parameter in group["params"] if group["per_frame"] else ():
+                if parameter.grad is None:
+                    continue
+                others = torch.ones(len(parameter), dtype=torch.bool)
+                others[frames] = False
+                state = self.state.get(parameter, {})
+                moments = {
+                    name: state[name][others] if name in state else torch.zeros_like(parameter[others])
+                    for name in ("exp_avg", "exp_avg_sq")
+                }
+                kept.append((parameter, others, parameter[others], moments))
+        self.step()
+        for parameter, others, values, moments in kept:
+            parameter[others] = values
+            for name, rows in moments.items():
+                self.state[parameter][name][others] = rows
+
+
+def make_optimizer(scene: Scene, lrs: Mapping[str, float], frame_moments: bool = False) -> FrameAdam:
     """Adam over the listed groups; everything else is set not to require a gradient.
+
+    `frame_moments` is as in `OptimizeStage`.
 
     The second moment's decay of 0.99 suits stages of hundreds of steps, where 0.999 would still remember
     the first.
@@ -91,8 +125,11 @@ def make_optimizer(scene: Scene, lrs: Mapping[str, float]) -> torch.optim.Adam:
         for parameter in parameters:
             parameter.requires_grad_(True)
         if parameters:
-            groups.append({"params": parameters, "lr": lr, "start_lr": lr, "name": name})
-    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
+            per_frame = frame_moments and name in _ROW_PER_FRAME
+            groups.append(
+                {"params": parameters, "lr": lr, "start_lr": lr, "name": name, "per_frame": per_frame}
+            )
+    return FrameAdam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def set_cosine_rates(

@@ -158,6 +158,7 @@ _JOINT = OptimizeStage(
     },
     image_size=240,
     frames_per_step=6,
+    frame_moments=True,
 )
 
 # The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.

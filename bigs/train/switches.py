@@ -176,6 +176,10 @@ _INGREDIENTS = {
         _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),
     ),
     "free_frames": Switch("steps for the frames between grasps alone", _free_frames),
+    "frame_moments": Switch(
+        "moments of each frame's own for turns and fingers",
+        lambda config: _keep(config, lambda stage: replace(stage, frame_moments=False)),
+    ),
     "lighting": Switch(
         "light and shade",
         _all_of(

@@ -79,3 +79,43 @@ def test_rates_fall_along_a_cosine(both_hands: dict[Side, HandModel]) -> None:
         set_cosine_rates(optimizer, progress, 0.1)
         rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
         assert rates == pytest.approx({"hand.ray": 0.5 * share, "hand.depth": 2.0 * share})
+
+
+def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side, HandModel]) -> None:
+    scene = cube_scene(both_hands)
+    optimizer = make_optimizer(
+        scene, {"hand.pose": 0.1, "hand.depth": 0.1, "object.orient": 0.1}, frame_moments=True
+    )
+    turns, depths = scene.hand_poses["right"].pose, scene.hand_poses["right"].position.log_depth
+    others = list(range(1, scene.n_frames))
+
+    def step(frame: int) -> None:
+        optimizer.zero_grad(set_to_none=True)
+        # As a prior over time has it, every frame has a gradient.
+        (turns.sum() + depths.sum() + scene.object_poses.orient.sum()).backward()
+        optimizer.step_frames(torch.tensor([frame]))
+
+    step(0)
+    assert torch.all(turns[0] == -turns[0].abs()) and torch.all(turns[0] != 0)
+    assert torch.all(turns[others] == 0) and torch.all(scene.object_poses.orient[others] == 0)
+    assert torch.all(optimizer.state[turns]["exp_avg"][others] == 0)
+    # Depths go on with every step.
+    assert torch.all(depths != 0)
+
+    first, moments = turns[0].clone(), optimizer.state[turns]["exp_avg_sq"][0].clone()
+    step(1)
+    assert torch.equal(turns[0], first) and torch.equal(optimizer.state[turns]["exp_avg_sq"][0], moments)
+    assert torch.all(turns[1] != 0)
+
+
+def test_a_step_on_all_frames_is_plain_adam(both_hands: dict[Side, HandModel]) -> None:
+    poses = []
+    for step_all in (True, False):
+        scene = cube_scene(both_hands)
+        optimizer = make_optimizer(scene, {"hand.pose": 0.1}, frame_moments=True)
+        for _ in range(3):
+            optimizer.zero_grad(set_to_none=True)
+            (scene.hand_poses["right"].pose - 1.0).square().sum().backward()
+            optimizer.step_frames(torch.arange(scene.n_frames)) if step_all else optimizer.step()
+        poses.append(scene.hand_poses["right"].pose.detach())
+    assert torch.equal(*poses) and torch.all(poses[0] != 0)
