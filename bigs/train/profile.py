@@ -20,6 +20,7 @@ from bigs.models.moments import Moments
 from bigs.models.scene import Scene
 from bigs.raster import rust
 from bigs.train import step, terms
+from bigs.train.optim import FrameAdam
 
 # What a step's time is split into; what is in none of them is the stage's `rest`.
 PHASES = (
@@ -140,7 +141,7 @@ def profiled() -> Iterator[Profile]:
         (step, "rasterization", _ENGINE),
         (rust._raster, "rasterize_backward", _ENGINE_BACK),
         (torch.Tensor, "backward", _BACK),
-        (torch.optim.Adam, "step", _OPTIMISER),
+        (FrameAdam, "step_frames", _OPTIMISER),
     ]
     with ExitStack() as stack:
         for owner, name, phase in functions:
