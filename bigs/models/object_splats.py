@@ -47,6 +47,17 @@ class CanonicalObject(NamedTuple):
     weights: Tensor  # [N, 16] how far each belongs to the surface's regions; rows sum to one
 
 
+class Anchors(NamedTuple):
+    """Where the field is evaluated, and the N Gaussians that it changes there; buffers of `ObjectSplats`."""
+
+    base_points: Tensor  # [N, 3] metres at the initial size
+    normals: Tensor  # [N, 3] unit
+    base_quats: Tensor  # [N, 4]
+    base_log_scales: Tensor  # [N, 3]
+    color_logits: Tensor  # [N, 3]
+    weights: Tensor  # [N, 16], as in `CanonicalObject`
+
+
 class ObjectSplats(nn.Module):
     """A canonical object: Gaussians on an initial surface, changed by triplane fields."""
 
@@ -75,6 +86,15 @@ class ObjectSplats(nn.Module):
         features = self.triplane.out_features
         self.appearance = AppearanceDecoder(features, config.decoders.appearance_width)
         self.geometry = GeometryDecoder(features, config.decoders.geometry_width, config.max_offset)
+
+    @property
+    def anchors(self) -> Anchors:
+        return Anchors(*(getattr(self, name) for name in Anchors._fields))
+
+    def place(self, anchors: Anchors) -> None:
+        """Evaluate the fields elsewhere from now on, at any number of places; they stay as they are."""
+        for name, values in anchors._asdict().items():
+            setattr(self, name, values)
 
     def forward(self) -> CanonicalObject:
         """Evaluate the fields once."""

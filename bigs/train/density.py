@@ -1,0 +1,173 @@
+"""Adaptive density control: which of the object's Gaussians become two, which go, and when.
+
+As in 3D Gaussian splatting, a Gaussian at whose centre on screen the loss pulls hard is one too few. Here its
+colour, size and place are a field's, so what is added or removed is where that field is evaluated: no moment
+of the optimiser belongs to a single Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bigs.geometry.rotations import quat_to_matrix
+from bigs.models.object_splats import Anchors, CanonicalObject
+
+# By what the two parts of a Gaussian are shorter than it: 3DGS's number.
+_SHORTER = 1.6
+# How far each lies from its middle, in standard deviations: both together then have its covariance. 3DGS
+# draws the places; but where a field moves neighbours alike, that leaves holes which nothing closes.
+_APART = math.sqrt(1.0 - _SHORTER**-2)
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When the object's Gaussians are cloned, split and pruned, and which of them.
+
+    Numbers are the released code's; where a condition of its can never be met, 3DGS's.
+    """
+
+    # The first time, the last and the time between as shares of the stage's steps: 3600, 14400 and 600 of
+    # 30 000. A stage of fewer steps does the same as often.
+    first: float = 0.12
+    last: float = 0.48
+    every: float = 0.02
+    # Mean over the views that show a Gaussian of the gradient at its centre on screen, in 3DGS's unit: error
+    # averaged over all pixels of the clip's image, per half that image. It depends neither on the size at
+    # which the stage looks nor on how large the object is there.
+    threshold: float = 2e-4
+    # A Gaussian under pull is cloned if its longest axis is up to this share of the object's radius, and
+    # split if it is longer. The released 0.001 is of metres: 1 mm, which for an object in hands is this.
+    small: float = 0.01
+    # Longer ones than this share are pruned, and so are those less opaque than `least_opacity`.
+    large: float = 0.1
+    least_opacity: float = 0.005
+    # Nothing is pruned below `floor` Gaussians, and none is added above `ceiling`.
+    floor: int = 10_000
+    ceiling: int = 200_000
+
+    def is_due(self, steps: int, step: int) -> bool:
+        """Whether a stage of `steps` steps clones, splits and prunes after its first `step` ones.
+
+        Not after the last: what is new then would never be optimised.
+        """
+        first, last, every = self._times(steps)
+        return 0 < step < steps and first <= step <= last and (step - first) % every == 0
+
+    def watches(self, steps: int, step: int) -> bool:
+        """Whether the step after `step` others counts in what decides the next time."""
+        first, last, every = self._times(steps)
+        until = first + every * ((min(last, steps - 1) - first) // every)
+        return first - every <= step < until
+
+    def _times(self, steps: int) -> tuple[int, int, int]:
+        return round(self.first * steps), round(self.last * steps), max(1, round(self.every * steps))
+
+
+class Pull(NamedTuple):
+    """What has been gathered of N Gaussians since the last time."""
+
+    total: Tensor  # [N] sum over the views that showed it of how hard the loss pulled at its centre
+    views: Tensor  # [N] how many these were
+    drift: Tensor  # [N, 3] summed gradient at its centre in the object's frame
+
+    @classmethod
+    def none(cls, count: int) -> Pull:
+        return cls(torch.zeros(count), torch.zeros(count), torch.zeros(count, 3))
+
+    def plus(self, on_screen: Tensor, shown: Tensor, drift: Tensor) -> Pull:
+        """With one step more; a new one, so that a kept one stays as it was.
+
+        Args:
+            on_screen: [B, N, 2] gradient in each of B views.
+            shown: [B, N] bool.
+            drift: [N, 3].
+        """
+        pull = on_screen.norm(dim=-1) * shown
+        return Pull(self.total + pull.sum(0), self.views + shown.sum(0), self.drift + drift)
+
+    @property
+    def mean(self) -> Tensor:
+        """[N]; 0 for what no view showed."""
+        return self.total / self.views.clamp_min(1.0)
+
+
+class Fates(NamedTuple):
+    """What becomes of N Gaussians; whoever is in none of these stays."""
+
+    cloned: Tensor  # [N] bool
+    split: Tensor
+    pruned: Tensor
+
+
+def fates(whole: CanonicalObject, pull: Tensor, radius: float, config: DensifyConfig) -> Fates:
+    """Decide over N Gaussians by their mean pull [N] on an object of some radius (metres).
+
+    Whom the ceiling leaves no room are those with the least pull; whom the floor spares, the more opaque and
+    the shorter. What pull splits is not pruned for its length.
+    """
+    count = len(pull)
+    transparent = whole.opacities < config.least_opacity
+    longest = whole.scales.amax(-1) / radius
+    wanting = (pull >= config.threshold) & ~transparent
+    oversized = (longest > config.large) & ~wanting
+    wanting = _first(wanting, -pull, config.ceiling - count)
+    # The most transparent go first, then the longest.
+    rank = torch.where(transparent, whole.opacities, 1.0 + 1.0 / longest)
+    pruned = _first(transparent | oversized, rank, count + int(wanting.sum()) - config.floor)
+    return Fates(wanting & (longest <= config.small), wanting & (longest > config.small), pruned)
+
+
+def _first(chosen: Tensor, rank: Tensor, room: int) -> Tensor:
+    """The `room` of lowest rank [N] among those chosen [N]; the earlier of equals."""
+    index = torch.nonzero(chosen).flatten()
+    index = index[rank[index].argsort(stable=True)[: max(room, 0)]]
+    return torch.zeros_like(chosen).index_fill(0, index, True)
+
+
+@torch.no_grad()
+def densified(
+    anchors: Anchors, whole: CanonicalObject, pull: Pull, config: DensifyConfig, isotropic: bool = False
+) -> Anchors:
+    """Where the field is to be evaluated from now on.
+
+    A clone stands one standard deviation off in the direction that lowers the loss. The two parts of a
+    Gaussian that is split lie side by side along its longest axis.
+
+    Args:
+        anchors: of N Gaussians.
+        whole: what the field makes of them now.
+        pull: gathered of them.
+        config: see that class.
+        isotropic: whether parts are shorter along all axes.
+    """
+    fate = fates(whole, pull.mean, object_radius(anchors.base_points), config)
+    rotations, scales = quat_to_matrix(whole.quats), whole.scales
+    downhill = -torch.nn.functional.normalize(pull.drift[fate.cloned], dim=-1)
+    own = rotations[fate.cloned].transpose(-1, -2) @ downhill[..., None]
+    aside = (rotations[fate.cloned] @ (scales[fate.cloned, :, None] * own))[..., 0]
+    clones = _take(anchors, fate.cloned)
+    clones = clones._replace(base_points=clones.base_points + aside)
+
+    halves = _take(anchors, fate.split)
+    along = torch.nn.functional.one_hot(scales[fate.split].argmax(-1), 3).to(scales)
+    aside = _APART * (rotations[fate.split] @ (scales[fate.split] * along)[..., None])[..., 0]
+    shorter = math.log(_SHORTER) * (torch.ones_like(along) if isotropic else along)
+    halves = halves._replace(base_log_scales=halves.base_log_scales - shorter)
+    pairs = [halves._replace(base_points=halves.base_points + side * aside) for side in (-1.0, 1.0)]
+    left = _take(anchors, ~(fate.split | fate.pruned))
+    return Anchors(*(torch.cat(values) for values in zip(left, clones, *pairs, strict=True)))
+
+
+def object_radius(points: Tensor) -> float:
+    """Largest distance of points [N, 3] from the middle of their bounding box."""
+    middle = 0.5 * (points.amin(0) + points.amax(0))
+    return float((points - middle).norm(dim=-1).amax())
+
+
+def _take(anchors: Anchors, which: Tensor) -> Anchors:
+    return Anchors(*(values[which] for values in anchors))
