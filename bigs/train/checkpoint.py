@@ -15,7 +15,9 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail
+from bigs.models.object_splats import Anchors, ObjectSplats
 from bigs.models.scene import ObjectSurface, Scene
+from bigs.train.density import Pull
 from bigs.train.loop import NUMBERS, StageState
 
 FORMAT = "bigs-checkpoint-3"
@@ -50,6 +52,8 @@ def save_checkpoint(
         for index, moments in state.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
         tensors |= {f"found.{name}": value for name, value in state.found.items()}
+        if state.pull is not None:
+            tensors |= {f"pull.{name}": value for name, value in state.pull._asdict().items()}
     tensors = {name: value.contiguous() for name, value in tensors.items()}
     metadata = {
         "format": FORMAT,
@@ -108,6 +112,9 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
         isinstance(scene.object_splats, ObjectDetail) and len(scene.object_splats.shift) == count
     ):
         scene.object_splats = ObjectDetail(count)
+    if isinstance(scene.object_splats, ObjectSplats):
+        # Of any number, since they may have been cloned, split and pruned.
+        scene.object_splats.place(Anchors(*(tensors[f"scene.object_splats.{n}"] for n in Anchors._fields)))
     if "scene.surface_verts" in tensors:
         scene.replace_surface(ObjectSurface(tensors["scene.surface_verts"], tensors["scene.surface_faces"]))
     scene.load_state_dict(
@@ -125,4 +132,5 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     found = {
         name.removeprefix("found."): value for name, value in tensors.items() if name.startswith("found.")
     }
-    return Position(position["stage"], resume | {"moments": moments, "found": found}, report)
+    pull = Pull(*(tensors[f"pull.{n}"] for n in Pull._fields)) if "pull.total" in tensors else None
+    return Position(position["stage"], resume | {"moments": moments, "found": found, "pull": pull}, report)

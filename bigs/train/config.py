@@ -9,6 +9,7 @@ from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.completion import CompletionConfig
+from bigs.train.density import DensifyConfig
 from bigs.train.initial import InitialConfig
 
 Step = Literal["single-subject", "interacting-subjects"]
@@ -39,6 +40,8 @@ class OptimizeStage:
     # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
     stop_patience: int = 0
     stop_gain: float = 0.002
+    # The object's Gaussians are cloned, split and pruned meanwhile; None keeps them as many as they are.
+    densify: DensifyConfig | None = None
 
 
 @dataclass(frozen=True)

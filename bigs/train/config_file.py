@@ -111,6 +111,8 @@ def _build(kind: Any, plain: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind):
         return _build_dataclass(kind, plain, where)
+    if origin is types.UnionType:  # a setting that may be absent
+        return None if plain is None else _build(arguments[0], plain, where)
     if origin is typing.Literal:
         if plain not in arguments:
             raise InputError(f"{where}: expected one of {', '.join(map(str, arguments))}, found {plain!r}")

@@ -102,6 +102,7 @@ def fit(
         config.prior.completion if any(isinstance(s, CompletionStage) for s in config.stages) else None,
     )
     scene = start.scene
+    gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
     report.skipped += [note for note in (network_note, prior_note) if note] + start.skipped
     report.seconds["start values"] = time.perf_counter() - began
     digest = run_digest(clip, scene, config, perceptual, denoiser)
@@ -158,6 +159,9 @@ def fit(
                 report.skipped.append(
                     f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had settled"
                 )
+            if last.pull is not None:
+                now = len(scene.object_splats.base_points)
+                report.facts["object Gaussians"] = f"{gaussians} at the start, {now} after {stage.name}"
         keep(index + 1, None)
     scene.requires_grad_(False)
     if start.known and not {"object completed", "prior"} & report.facts.keys():

@@ -12,8 +12,10 @@ from torch import Tensor
 
 from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
+from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
 from bigs.train.config import OptimizeStage
+from bigs.train.density import DensifyConfig, Pull, densified
 from bigs.train.optim import FIELD_GROUPS, make_optimizer, set_cosine_rates
 from bigs.train.step import Evidence, Step
 from bigs.train.terms import IMAGE_TERMS, TERMS
@@ -40,13 +42,14 @@ class StageState(NamedTuple):
     smoothed: float
     retreats: int  # how often the stage went back after something that was not finite
     found: Mapping[str, Tensor]  # what the stage began from, by name, where it has to know that
+    pull: Pull | None  # at the object's Gaussians since they were last cloned, split and pruned
 
     @classmethod
     def begun(
         cls, step: int, optimizer: torch.optim.Optimizer, found: Mapping[str, Tensor] | None = None
     ) -> StageState:
         """After `step` steps, of whose losses nothing is known yet."""
-        return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {})
+        return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {}, None)
 
 
 # The parts of `StageState` that are plain numbers.
@@ -122,9 +125,12 @@ def run_stage(
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)
     state = StageState.begun(0, optimizer)
+    densify = None if scene.object_splats is None else stage.densify
+    if densify is not None:
+        state = state._replace(pull=Pull.none(len(_field_of_object(scene, stage).base_points)))
     if resume is not None:
         optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
-        state = state._replace(**{key: resume[key] for key in NUMBERS})
+        state = state._replace(**{key: resume[key] for key in NUMBERS}, pull=resume["pull"])
 
     entities = stage_entities(scene, stage)
     frozen = {
@@ -139,7 +145,7 @@ def run_stage(
         # A frozen field is evaluated once for the whole stage.
         fixed = scene.canonical(frozen) if needs_canonical else {}
 
-    kept = _Kept(state)
+    kept = _Kept(scene, state)
     while state.step < stage.steps and not _has_settled(stage, state):
         began = time.perf_counter()
         moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
@@ -153,6 +159,7 @@ def run_stage(
             "labels" in stage.weights,
             seed * 1_000_003 + state.step,
             stage.free_frames,
+            densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
         )
         terms, problem = _evaluate(step, stage)
         loss = weighted_sum(terms, stage.weights) if problem is None else None
@@ -166,15 +173,17 @@ def run_stage(
             where = f"stage {stage.name}, step {state.step}: {problem}"
             if state.retreats == MOST_RETREATS:
                 raise FloatingPointError(where)
-            state = kept.restore(optimizer)._replace(retreats=state.retreats + 1)
+            state = kept.restore(scene, optimizer)._replace(retreats=state.retreats + 1)
             warn(f"{where}; back to step {state.step} with half the rates")
             continue
         progress = state.step / max(stage.steps, 1)
         set_cosine_rates(optimizer, progress, stage.final_lr, 0.5**state.retreats)
         optimizer.step_frames(frames)
         state = _advance(stage, state, float(loss.detach()))
+        if densify is not None:
+            state = _densify(scene, step, densify, stage.steps, state)
         if state.step % keep_every == 0:
-            kept = _Kept(state)
+            kept = _Kept(scene, state)
         after_step(
             StageProgress(
                 state.step,
@@ -186,6 +195,27 @@ def run_stage(
             state,
         )
     return state
+
+
+def _field_of_object(scene: Scene, stage: OptimizeStage) -> ObjectSplats:
+    if not isinstance(scene.object_splats, ObjectSplats):
+        raise InputError(
+            f"stage {stage.name}: expected densify where the object has a field, found Gaussians of their own"
+        )
+    return scene.object_splats
+
+
+def _densify(scene: Scene, step: Step, config: DensifyConfig, steps: int, state: StageState) -> StageState:
+    """Add a step to what is known of the object's Gaussians; clone, split and prune them when it is time."""
+    gathered = step.object_pull() if step.watched else None
+    pull = state.pull if gathered is None else state.pull.plus(*gathered)
+    if config.is_due(steps, state.step):
+        splats = scene.object_splats
+        with torch.no_grad():
+            whole = splats()
+        splats.place(densified(splats.anchors, whole, pull, config, splats.config.isotropic))
+        pull = Pull.none(len(splats.base_points))
+    return state._replace(pull=pull)
 
 
 def _spare_grasps(scene: Scene) -> None:
@@ -230,15 +260,21 @@ def _unbounded_gradient(scene: Scene) -> str | None:
 
 
 class _Kept:
-    """A state to go back to: copies of what is trained and of the optimiser's moments."""
+    """A state to go back to: copies of what is trained and of the optimiser's moments.
 
-    def __init__(self, state: StageState) -> None:
+    Where the object's field is evaluated is not changed in place, so it needs no copy.
+    """
+
+    def __init__(self, scene: Scene, state: StageState) -> None:
         self._state = state
+        self._anchors = None if state.pull is None else scene.object_splats.anchors
         self._values = [p.detach().clone() for p in _trained(state.optimizer)]
         self._moments = copy.deepcopy(state.optimizer.state_dict()["state"])
 
     @torch.no_grad()
-    def restore(self, optimizer: torch.optim.Optimizer) -> StageState:
+    def restore(self, scene: Scene, optimizer: torch.optim.Optimizer) -> StageState:
+        if self._anchors is not None:
+            scene.object_splats.place(self._anchors)
         for parameter, value in zip(_trained(optimizer), self._values, strict=True):
             parameter.copy_(value)
         optimizer.load_state_dict(optimizer.state_dict() | {"state": copy.deepcopy(self._moments)})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 from bigs.checks import InputError
 from bigs.train.config import (
@@ -13,7 +14,9 @@ from bigs.train.config import (
     RunConfig,
     ScaleSearchStage,
     SplitStage,
+    Stage,
 )
+from bigs.train.density import DensifyConfig
 from bigs.train.optim import GROUPS
 from bigs.train.terms import IMAGE_TERMS, TERMS
 
@@ -59,10 +62,11 @@ def check_plan(config: RunConfig) -> None:
         _check_numbers(f"{where}.", stage, _LEAST_OF_STAGE[type(stage)])
         if isinstance(stage, OptimizeStage):
             _check_names(where, stage)
-            if stage.free_frames and stage.step != "single-subject":
-                raise InputError(
-                    f"{where}: expected free_frames with step single-subject, found {stage.step}"
-                )
+            for name, given in (("free_frames", stage.free_frames), ("densify", stage.densify is not None)):
+                if given and stage.step != "single-subject":
+                    raise InputError(f"{where}: expected {name} with step single-subject, found {stage.step}")
+            if stage.densify is not None:
+                _check_densify(f"{where}.densify", stage, stage.densify, config.stages)
     for name, (*others, last) in COMPILED.items():
         value = getattr(config.raster, name)
         if value not in (*others, last):
@@ -76,6 +80,33 @@ def _check_names(where: str, stage: OptimizeStage) -> None:
         for name in given:
             if name not in known:
                 raise InputError(f"{where}: expected {kind} out of {', '.join(known)}, found {name!r}")
+
+
+def _check_densify(
+    where: str, stage: OptimizeStage, config: DensifyConfig, stages: tuple[Stage, ...]
+) -> None:
+    for other in stages[: stages.index(stage)]:
+        if isinstance(other, SplitStage | CompletionStage | GuidanceStage):
+            raise InputError(
+                f"{where}: expected a stage in which the object has a field, found one after {other.name}"
+            )
+    if not {"object.geometry", "object.triplane"} & set(stage.lrs):
+        raise InputError(f"{where}: expected a rate for object.geometry or object.triplane, found neither")
+    # From the least to the largest; a comparison with NaN is false.
+    orders: tuple[dict[str, float], ...] = (
+        {"0": 0.0, "first": config.first, "last": config.last, "1": 1.0},
+        {"every": config.every, "1": 1.0},
+        {"0": 0.0, "threshold": config.threshold},
+        {"0": 0.0, "small": config.small, "large": config.large},
+        {"0": 0.0, "least_opacity": config.least_opacity, "1": 1.0},
+        {"1": 1, "floor": config.floor, "ceiling": config.ceiling},
+    )
+    for order in orders:
+        if not all(low <= high for low, high in pairwise(order.values())):
+            found = ", ".join(map(str, order.values()))
+            raise InputError(f"{where}: expected {' <= '.join(order)}, found {found}")
+    if config.every <= 0.0:
+        raise InputError(f"{where}.every: expected more than 0, found {config.every}")
 
 
 def _check_numbers(where: str, owner: object, least: Mapping[str, float]) -> None:

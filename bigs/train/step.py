@@ -15,6 +15,7 @@ from bigs.models.moments import Moments
 from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene, concatenate
 from bigs.raster import rasterization
+from bigs.raster.api import Means2d
 from bigs.raster.settings import RasterSettings
 from bigs.train.targets import Targets
 from bigs.types import Entity, Gaussians, RenderOutput, Side
@@ -59,7 +60,12 @@ class Step:
     with_labels: bool = True  # whether the joint rendering has label channels
     seed: int = 0  # of what the terms draw
     free_frames: bool = False  # whether a hand alone is looked at where it holds nothing, instead of `frames`
+    watched: bool = False  # whether `object_pull` will be asked for
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.watched:
+            self.canonical["object"].means.retain_grad()
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -107,7 +113,7 @@ class Step:
         """A fresh one for each term, so that what one term draws does not depend on the others."""
         return torch.Generator().manual_seed(self.seed)
 
-    def render(self, gaussians: Gaussians) -> RenderOutput:
+    def render(self, gaussians: Gaussians, means2d: Means2d = "values") -> RenderOutput:
         """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
         targets = self.evidence.targets
         out = rasterization(
@@ -117,6 +123,7 @@ class Step:
             targets.width,
             targets.height,
             settings=self.evidence.settings,
+            means2d=means2d,
         )
         # Not [:, 0], whose gradient would be copied into zeros.
         return RenderOutput(out.colors.squeeze(1), out.alphas.squeeze(1), out.info)
@@ -125,8 +132,32 @@ class Step:
         """One subject rendered without the others (the paper's single-subject step)."""
         if entity not in self._alone:
             frames = self.frames_of(entity)
-            self._alone[entity] = self.render(self.clip.at(frames).posed(entity, self.canonical[entity]))
+            posed = self.clip.at(frames).posed(entity, self.canonical[entity])
+            if self.watched and entity == "object":
+                self._alone[entity] = self.render(posed, "full")
+                self._alone[entity].info["means2d"].retain_grad()
+            else:
+                self._alone[entity] = self.render(posed)
         return self._alone[entity]
+
+    def object_pull(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """How the loss pulls at the object's N Gaussians, after the backward pass of a watched step.
+
+        Returns:
+            The gradient [B, N, 2] at their centres on screen, of an error averaged over all pixels of one of
+            the clip's images, per half that image; whether each is in view [B, N]; the gradient [N, 3] at
+            their centres in the object's frame. None if no term has rendered the object alone.
+        """
+        if "object" not in self._alone:
+            return None
+        info = self._alone["object"].info
+        # The clip's whole image in pixels of this stage's.
+        zoom = self.evidence.targets.K.diagonal()[:2] / self.scene.K.diagonal()[:2]
+        size = zoom * zoom.new_tensor([self.scene.width, self.scene.height])
+        # Terms of images average over the object's pixels in all views, and over the subjects.
+        average = len(self.entities) * self.share_alone("object").sum() / size.prod()
+        on_screen = average * 0.5 * size * info["means2d"].grad.squeeze(1)
+        return on_screen, info["depths"].squeeze(1) > 0, self.canonical["object"].means.grad
 
     @cached_property
     def together(self) -> RenderOutput:

@@ -30,7 +30,7 @@ def test_plain_data_is_plain() -> None:
             return [leaf for key, value in node.items() for leaf in [key, *leaves(value)]]
         return [leaf for value in node for leaf in leaves(value)] if isinstance(node, list) else [node]
 
-    assert {type(leaf) for leaf in leaves(to_plain(PRESETS["full"]))} <= {str, int, float, bool}
+    assert {type(leaf) for leaf in leaves(to_plain(PRESETS["full"]))} <= {str, int, float, bool, type(None)}
 
 
 def plain() -> dict[str, Any]:
