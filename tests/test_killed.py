@@ -39,6 +39,9 @@ QUICK = [
     for stage, n in STEPS.items()
     for change in (f"steps={n}", "image_size=40")
 ]
+# The object's Gaussians become more after the first step of a stage and, after a checkpoint, the second.
+DENSIFY = "{first: 0.3, last: 0.9, every: 0.3, threshold: 1.0e-9, floor: 1, ceiling: 900}"
+QUICK.append(f"--set=stages.appearance.densify={DENSIFY}")
 
 
 @pytest.fixture(scope="module")

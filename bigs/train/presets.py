@@ -17,6 +17,7 @@ from bigs.train.config import (
     ScaleSearchStage,
     SplitStage,
 )
+from bigs.train.density import DensifyConfig
 from bigs.train.initial import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
@@ -330,6 +331,7 @@ PAPER = RunConfig(
             weights=_PAPER_IMAGE,
             frames_per_step=1,
             final_lr=1.0,
+            densify=DensifyConfig(),
         ),
         CompletionStage(),
         GuidanceStage(steps=1000),

@@ -203,6 +203,10 @@ _INGREDIENTS = {
             _groups("hand.geometry", "hand.shift", "hand.size"),
         ),
     ),
+    "densify": Switch(
+        "the object's Gaussians that are cloned, split and pruned",
+        lambda config: _keep(config, lambda stage: replace(stage, densify=None)),
+    ),
     "split": Switch(
         "Gaussians that leave their fields, the object's in finer parts",
         lambda c: _keep(c, leave_out=SplitStage),
