@@ -202,7 +202,8 @@ class Undisturbed(NamedTuple):
 
 @pytest.fixture(scope="module")
 def undisturbed(tiny: Clip, both_hands: dict[Side, HandModel]) -> Undisturbed:
-    config = object_plan(40, 20, replace(FEW, first=0.25, every=0.15))
+    # Only clones, which stand where all that was gathered points to.
+    config = object_plan(40, 20, replace(FEW, first=0.25, every=0.15, small=10.0))
     scene, report = fit(tiny, both_hands, config)
     return Undisturbed(config, scene.state_dict(), report.facts)
 
