@@ -6,27 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
+from toy_stages import ALONE, TOGETHER, values
 
 from bigs.checks import InputError
-from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.config import OptimizeStage
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.step import Evidence
 from bigs.train.terms import TERMS
-from bigs.types import Side
-
-
-@pytest.fixture
-def scene(both_hands: dict[Side, HandModel]) -> Scene:
-    return held_cube(both_hands)
-
-
-@pytest.fixture
-def evidence(scene: Scene) -> Evidence:
-    return random_evidence(scene)
-
 
 # --- what breaks ---
 

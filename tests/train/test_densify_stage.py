@@ -43,16 +43,6 @@ LRS = {"object.triplane": 1e-2, "object.geometry": 1e-3, "object.appearance": 1e
 STAGE = replace(ALONE, steps=10, lrs=LRS, weights={"image": 1.0, "coverage": 0.5}, densify=EAGER)
 
 
-@pytest.fixture
-def scene(both_hands: dict[Side, HandModel]) -> Scene:
-    return held_cube(both_hands)
-
-
-@pytest.fixture
-def evidence(scene: Scene) -> Evidence:
-    return random_evidence(scene)
-
-
 def count(scene: Scene) -> int:
     return len(scene.object_splats().means)
 

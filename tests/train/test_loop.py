@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
+from toy_stages import ALONE, TOGETHER, values
 
-from bigs.hand import HandModel
 from bigs.losses.mask import label_difference, outside_mask, spilled
 from bigs.losses.photometric import masked_l1, masked_mse
 from bigs.models.hand_detail import free_hand
@@ -24,18 +23,6 @@ from bigs.train.optim import GROUPS, group_parameters
 from bigs.train.step import Evidence, Step
 from bigs.train.targets import Targets
 from bigs.train.terms import IMAGE_TERMS, TERMS
-from bigs.types import Side
-
-
-@pytest.fixture
-def scene(both_hands: dict[Side, HandModel]) -> Scene:
-    return held_cube(both_hands)
-
-
-@pytest.fixture
-def evidence(scene: Scene) -> Evidence:
-    return random_evidence(scene)
-
 
 # --- frames ---
 
