@@ -69,8 +69,8 @@ def build_scene(
         hand_models: both sides' models in their files' own conventions.
         initial, hand, obj: see those classes.
         lighting: whether colours depend on the direction a surface faces.
-        completion: where much of the object was never seen, its symmetries tell what hands may meet there;
-            if it has none, they meet nothing there. Without it they meet the closed surface.
+        completion: where much of the object was never seen, its symmetries are looked for; if it has none,
+            hands meet nothing there. Otherwise, and without it, they meet the closed surface.
     """
     starts = {
         side: smooth_hand(
@@ -155,9 +155,9 @@ def _object_surfaces(
     known = KnownPart(_as_surface(*kept), left_out) if left_out > _LITTLE else None
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
-        found = complete(carving, start, initial, completion)
-        symmetries = found.symmetries
-        grid = found.surface if symmetries else support.without_guesses(grid, initial.surface_solid)
+        symmetries = complete(carving, start, initial, completion).symmetries
+        if not symmetries:
+            grid = support.without_guesses(grid, initial.surface_solid)
     return _ObjectSurfaces(closed, known, grid, symmetries, [])
 
 

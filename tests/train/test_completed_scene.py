@@ -94,6 +94,14 @@ def test_the_shape_gains_and_nothing_that_was_seen_changes(
     assert not any(parameter.requires_grad for parameter in completed[0].parameters())
 
 
+def test_hands_meet_what_they_meet_without_it(
+    plain: tuple[Scene, FitReport], completed: tuple[Scene, FitReport]
+) -> None:
+    """Or poses would depend on a symmetry, and in all but the frames' own errors some would get worse."""
+    assert completed[1].facts["object completed"]
+    assert torch.equal(plain[0].object_distance.values, completed[0].object_distance.values)
+
+
 def test_what_is_added_shows_in_no_frame(
     plain: tuple[Scene, FitReport],
     completed: tuple[Scene, FitReport],
