@@ -22,12 +22,11 @@ from bigs.train.carving import carve
 from bigs.train.completion import Completion, CompletionConfig, complete
 from bigs.train.config import CompletionStage
 from bigs.train.initial import InitialConfig, ObjectStart, object_in_camera
-from bigs.train.seen import frames_seen, guard_frames, image_error, object_views, weights_in_pictures
+from bigs.train.seen import SHOWS, frames_seen, guard_frames, image_error, object_views, weights_in_pictures
 from bigs.train.step import Evidence
 
-# A Gaussian that weighs so much in some frame's picture, in pixels, is left, and none is added that would.
-# Where one is taken away the next may show, so they are looked at again.
-_SHOWS = 0.002
+# A Gaussian that shows is left, and none is added that would. Where one is taken away the next may show, so
+# they are looked at again.
 _PASSES = 3
 # Colours of what was never seen are means over so many of their images: a pattern need not go on as it began.
 _COLORS_FROM = 8
@@ -78,12 +77,12 @@ def complete_scene(
     before = image_error(scene, evidence, scene.entities, frames)
     splats, surface = scene.object_splats, scene.object_surface
     detail = splats if isinstance(splats, ObjectDetail) else split_object(canonical, 1, 0.0)
-    left = weights_in_pictures(scene, evidence) >= _SHOWS
+    left = weights_in_pictures(scene, evidence) >= SHOWS
     verts, faces = extract_mesh(found.surface)
     added = _far_side(canonical, left.numpy(), found, verts, faces, obj)
     for _ in range(_PASSES):
         scene.object_splats = replace_gaussians(detail, left, added)
-        hidden = weights_in_pictures(scene, evidence)[int(left.sum()) :] < _SHOWS
+        hidden = weights_in_pictures(scene, evidence)[int(left.sum()) :] < SHOWS
         added = CanonicalObject(*(values[hidden] for values in added))
         if hidden.all():
             break

@@ -18,11 +18,21 @@ from bigs.raster.settings import RasterSettings
 from bigs.train.completed_scene import CompletedScene
 from bigs.train.config import GuidanceStage
 from bigs.train.guided import AfterStep, Coverage, Hold, coverage_of, follow, guide_object, render_object
-from bigs.train.seen import frames_seen, guard_frames, image_error, object_views, overflow
+from bigs.train.seen import (
+    SHOWS,
+    frames_seen,
+    guard_frames,
+    image_error,
+    object_views,
+    overflow,
+    weights_in_pictures,
+)
 from bigs.train.step import Evidence, Step
 
 # A Gaussian counts as seen when it shows in so many frames: fewer may be a fault of mask or pose.
 _LEAST_FRAMES = 3
+# Where one of those that have come to show is put back the next may show, so they are looked at again.
+_PASSES = 3
 # The pictures of so many frames are kept to hold the object by.
 _HOLDING_FRAMES = 60
 
@@ -84,6 +94,11 @@ def guide_scene(
             f"times as wrong as about what it learned from ({stage.unlike} is allowed)"
         )
         return CompletedScene(reason, facts)
+    # What shows in any frame stays, even where too few show it to be sure of it.
+    held = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
+    if held.seen.all():
+        return CompletedScene("all of the object's Gaussians show", facts)
+    found = {name: value.clone() for name, value in detail.state_dict().items()}
     some, every = guard_frames(scene.n_frames), torch.arange(scene.n_frames)
 
     def faults() -> Tensor:
@@ -92,7 +107,7 @@ def guide_scene(
 
     done = guide_object(
         detail,
-        coverage,
+        held,
         orbit,
         denoiser,
         stage,
@@ -106,15 +121,30 @@ def guide_scene(
     if done.rolled_back:
         reason = f"undone, since the clip's frames would show worse ({done.worst:+.1%} error or size)"
         return CompletedScene(reason, facts)
+    _put_back(scene, evidence, detail, found, held.seen)
     with torch.no_grad():
         scene.surface_verts.copy_(follow(scene.surface_verts, canonical.means, done.moved))
-    moved = 1e3 * float(done.moved[~coverage.seen].norm(dim=-1).mean())
+    moved = 1e3 * float(done.moved[~held.seen].norm(dim=-1).mean())
     looked = float((coverage.by_direction < stage.well_seen).float().mean())
     facts["prior"] = (
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
         f"error of what was seen {done.worst:+.1%} at most"
     )
     return CompletedScene(None, facts)
+
+
+def _put_back(
+    scene: Scene, evidence: Evidence, detail: ObjectDetail, found: Mapping[str, Tensor], held: Tensor
+) -> None:
+    """Give those Gaussians that were not `held` [N] and have come to show in a frame what they had before."""
+    free = ~held
+    for _ in range(_PASSES):
+        showing = free & (weights_in_pictures(scene, evidence) >= SHOWS)
+        if not showing.any():
+            return
+        for name, value in detail.state_dict().items():
+            value[showing] = found[name][showing]
+        free &= ~showing
 
 
 def strangeness(

@@ -17,6 +17,8 @@ from bigs.types import Entity
 
 # Poses are wrong by about so much, metres.
 _TOLERANCE = 0.006
+# A Gaussian that weighs so much in some frame's picture, in pixels, shows.
+SHOWS = 0.002
 # Frames on which errors are measured.
 _GUARD_FRAMES = 12
 

@@ -24,11 +24,14 @@ from bigs.train.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.evidence import EvidenceSource
 from bigs.train.fit import FitReport, fit
 from bigs.train.presets import PRESETS, SMOKE
-from bigs.train.seen import image_error, overflow
+from bigs.train.seen import SHOWS, image_error, overflow, weights_in_pictures
 from bigs.types import Side
 
 STAGE = GuidanceStage(steps=3, views=2, image_size=32)
-PLAN = replace(SMOKE, stages=(SplitStage(parts=1), STAGE))
+# Gaussians enough that some are hidden by others in every frame.
+PLAN = replace(
+    SMOKE, object=replace(SMOKE.object, n_gaussians=3000), stages=(SplitStage(parts=1), STAGE)
+)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +66,26 @@ def test_the_unseen_part_moves_and_its_surface_follows(
     assert 0.1 < float((change == 0).float().mean()) < 0.95
     assert float((after.object_surface.verts - before.object_surface.verts).abs().max()) > 1e-5
     assert not any(parameter.requires_grad for parameter in after.parameters())
+
+
+def test_what_shows_in_a_frame_stays(
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+) -> None:
+    """To the last bit, even where fewer frames show it than count as having seen it; nor does more show."""
+    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+    wild = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, hold=0.0)
+    after, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), wild)), prior)
+    assert "moved" in report.facts["prior"]
+    nothing = np.zeros((5, one_side.height, one_side.width), dtype=bool)
+    evidence = EvidenceSource(one_side, nothing, before, PLAN, None).evidence(
+        replace(SMOKE.stages[0], image_size=240)
+    )
+    shown, now = (weights_in_pictures(scene, evidence) for scene in (before, after))
+    changed = torch.zeros(len(shown), dtype=torch.bool)
+    for name, value in before.object_splats.state_dict().items():
+        changed |= (after.object_splats.state_dict()[name] != value).reshape(len(value), -1).any(1)
+    assert int(changed.sum()) > 100 and float(shown[changed].max()) < SHOWS
+    assert float(now[changed].max()) < 0.05
 
 
 def test_a_prior_that_does_not_know_the_object_is_left_out(
