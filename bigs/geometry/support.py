@@ -58,11 +58,15 @@ class Support:
         return float((self._of_sample >= reach).mean())
 
     def known_part(self, verts: np.ndarray, faces: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of a mesh that lie within `reach` metres of what is shown."""
+        """Of a mesh, what lies within `reach` metres of what is shown.
+
+        Returns:
+            Indices of its vertices, and faces among these.
+        """
         near = self._shown.query(verts)[0] < reach
         kept = faces[near[faces].all(axis=1)]
         used, kept = np.unique(kept, return_inverse=True)
-        return verts[used], kept.reshape(-1, 3)
+        return used, kept.reshape(-1, 3)
 
     def without_guesses(self, grid: DistanceGrid, reach: float) -> DistanceGrid:
         """The signed distance without what lies behind surface further than `reach` from what is shown.

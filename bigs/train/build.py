@@ -36,10 +36,15 @@ from bigs.types import Side
 
 
 class KnownPart(NamedTuple):
-    """The object's surface without what nothing speaks for."""
+    """What of the object's closed surface something speaks for."""
 
-    surface: ObjectSurface
+    verts: Tensor  # [V] indices of its vertices
+    faces: Tensor  # [F, 3] among these
     left_out: float  # share of the closed surface's area
+
+    def of(self, closed: ObjectSurface) -> ObjectSurface:
+        """That part of the closed surface, whose vertices may have moved."""
+        return ObjectSurface(closed.verts[self.verts], self.faces)
 
 
 class SceneStart(NamedTuple):
@@ -150,9 +155,11 @@ def _object_surfaces(
     support = Support(
         seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
     )
-    kept = support.known_part(*closed, initial.surface_kept)
-    left_out = 1.0 - face_areas(*kept).sum() / face_areas(*closed).sum()
-    known = KnownPart(_as_surface(*kept), left_out) if left_out > _LITTLE else None
+    verts, faces = support.known_part(*closed, initial.surface_kept)
+    left_out = 1.0 - face_areas(closed[0][verts], faces).sum() / face_areas(*closed).sum()
+    known = None
+    if left_out > _LITTLE:
+        known = KnownPart(torch.as_tensor(verts), torch.as_tensor(faces), left_out)
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
         symmetries = complete(carving, start, initial, completion).symmetries

@@ -164,8 +164,8 @@ def fit(
                 report.facts["object Gaussians"] = f"{gaussians} at the start, {now} after {stage.name}"
         keep(index + 1, None)
     scene.requires_grad_(False)
-    if start.known and not {"object completed", "prior"} & report.facts.keys():
-        scene.replace_surface(start.known.surface)
+    if start.known and "object completed" not in report.facts:
+        scene.replace_surface(start.known.of(scene.object_surface))
         report.facts["object mesh"] = (
             f"open: {start.known.left_out:.0%} of it would be further than "
             f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"

@@ -153,7 +153,7 @@ def test_where_nothing_speaks_for_a_surface(
         whole = cut.scene.object_surface.verts
         assert torch.equal(whole, scene.object_surface.verts)
         assert cut.known is not None and 0.01 < cut.known.left_out < 0.5
-        kept = cut.known.surface.verts
+        kept = cut.known.of(cut.scene.object_surface).verts
         gone = ~(whole[:, None] == kept[None]).all(-1).any(1)
         assert 0 < int(gone.sum()) == len(whole) - len(kept)
         field = cut.scene.object_distance
