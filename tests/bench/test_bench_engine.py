@@ -6,6 +6,8 @@ import builtins
 import importlib
 import json
 import os
+import subprocess
+import sys
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -138,6 +140,15 @@ def test_memory_of_some_work() -> None:
     assert peak_of(lambda: bytearray(os.urandom(1)) * 50_000_000) > 40e6
     free = free_memory()
     assert free is None or free > 2**20
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no record of this process alone")
+def test_the_largest_so_far_is_not_that_of_the_process_that_started_this_one() -> None:
+    """Linux keeps `ru_maxrss` over exec: `bigs prior fit` called from a notebook told the notebook's size."""
+    large = bytearray(os.urandom(1)) * 300_000_000
+    ask = "from bigs.bench.machine import largest_so_far; print(largest_so_far())"
+    told = float(subprocess.run([sys.executable, "-c", ask], capture_output=True, check=True).stdout)
+    assert 5e6 < told < 0.5 * len(large)
 
 
 def test_an_environment_holds_in_its_worker_only() -> None:
