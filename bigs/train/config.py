@@ -157,7 +157,7 @@ class GuidanceStage:
     # Weight by which the clip's frames hold what they show of the object as it was found, per pixel.
     hold: float = 0.3
     # A prior that says so much more wrongly what was seen than what it learned from does not know the object.
-    unlike: float = 1.4
+    unlike: float = 1.2
 
 
 Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | CompletionStage | GuidanceStage
