@@ -23,7 +23,9 @@ STAGE = GuidanceStage(steps=3, views=2, image_size=32, enough=2.0, well_seen=2.0
 @pytest.fixture
 def plan(tmp_path: Path) -> Path:
     """A configuration of start values and the prior, nothing else."""
-    config: RunConfig = replace(SMOKE, stages=(SplitStage(parts=1), STAGE))
+    # Gaussians enough that some are hidden in every frame.
+    splats = replace(SMOKE.object, n_gaussians=3000)
+    config: RunConfig = replace(SMOKE, object=splats, stages=(SplitStage(parts=1), STAGE))
     save_config(tmp_path / "plan.yaml", config, {})
     return tmp_path / "plan.yaml"
 
