@@ -30,6 +30,9 @@ from bigs.train.step import Evidence
 _PASSES = 3
 # Colours of what was never seen are means over so many of their images: a pattern need not go on as it began.
 _COLORS_FROM = 8
+# The colour of a place is a mean over so many Gaussians: after many steps neighbours differ by more than the
+# surface does, since only their sum shows.
+_BLENDED = 24
 
 
 class CompletedScene(NamedTuple):
@@ -107,9 +110,19 @@ def _at_final_poses(scene: Scene, clip: Clip, evidence: Evidence, initial: Initi
         shown[:] = True
     start = object_in_camera(clip, initial)
     pose = scene.at(torch.arange(scene.n_frames)).object
-    nearest = scipy.spatial.cKDTree(canonical.means.numpy()[shown]).query(start.points)[1]
-    colors = canonical.colors.numpy()[shown][nearest]
+    colors = blended_colors(canonical, shown, start.points)
     return start._replace(rotations=pose.rotations, centers=pose.centers / pose.scale, colors=colors)
+
+
+def blended_colors(canonical: CanonicalObject, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The colours [M, 3] that those `chosen` [N] (bool) of N Gaussians together have at points [M, 3]."""
+    index = np.flatnonzero(chosen)
+    nearest = range(1, min(_BLENDED, len(index)) + 1)
+    near = index[scipy.spatial.cKDTree(canonical.means.numpy()[index]).query(points, k=nearest)[1]]
+    # What a Gaussian covers where it lies flat.
+    area = canonical.opacities * canonical.scales.sort(dim=-1).values[:, 1:].prod(-1)
+    weights = area.numpy()[near, None]
+    return (weights * canonical.colors.numpy()[near]).sum(1) / weights.sum(1)
 
 
 def _far_side(

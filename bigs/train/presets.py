@@ -280,7 +280,8 @@ SMOKE = replace(
         replace(_CONTACT, steps=8, image_size=80),
         replace(_REGRASP, steps=8, image_size=80),
         SplitStage(),
-        replace(_JOINT, steps=12, image_size=80, frames_per_step=3),
+        # Too few steps for frames to get anywhere on their own.
+        replace(_JOINT, steps=12, image_size=80, frames_per_step=3, frame_moments=False),
         replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),
         CompletionStage(),
         GuidanceStage(steps=4, views=2),

@@ -64,23 +64,17 @@ def test_the_unseen_side_comes_nearer_to_the_truth(
     assert after.f5 > before.f5 and after.f10 >= before.f10
 
 
-def test_hands_meet_the_far_side_that_symmetry_tells(
+def test_a_symmetry_found_at_the_start_leaves_what_hands_meet(
     one_side: tuple[Clip, Carving, ObjectStart], both_hands: dict[Side, HandModel]
 ) -> None:
     clip, carving, start = one_side
     found = complete(carving, start, INITIAL, CompletionConfig())
-    built = build_scene(
-        clip,
-        nothing_hides(clip),
-        both_hands,
-        INITIAL,
-        SMOKE.hand,
-        SMOKE.object,
-        False,
-        CompletionConfig(),
-    )
-    assert len(built.symmetries) == len(found.symmetries) > 0
-    assert torch.equal(built.scene.object_distance.values, DistanceField(found.surface).values)
+    plan = (clip, nothing_hides(clip), both_hands, INITIAL, SMOKE.hand, SMOKE.object, False)
+    built, plain = build_scene(*plan, CompletionConfig()), build_scene(*plan)
+    assert len(built.symmetries) == len(found.symmetries) > 0 and not plain.symmetries
+    solid = built.scene.object_distance.values
+    assert torch.equal(solid, plain.scene.object_distance.values)
+    assert not torch.equal(solid, DistanceField(found.surface).values)
 
 
 def test_symmetries_found_earlier_count_if_there_are_none_now(
