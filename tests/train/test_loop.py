@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from toy_stages import ALONE, TOGETHER, values
+from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
 
+from bigs.hand import HandModel
 from bigs.losses.mask import label_difference, outside_mask, spilled
 from bigs.losses.photometric import masked_l1, masked_mse
 from bigs.models.hand_detail import free_hand
@@ -23,6 +24,7 @@ from bigs.train.optim import GROUPS, group_parameters
 from bigs.train.step import Evidence, Step
 from bigs.train.targets import Targets
 from bigs.train.terms import IMAGE_TERMS, TERMS
+from bigs.types import Side
 
 # --- frames ---
 
@@ -317,3 +319,19 @@ def test_what_terms_draw_depends_on_seed_and_step_alone(scene: Scene, evidence: 
     torch.rand(5)
     assert losses(0) == first
     assert not set(losses(1)) & set(first)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_frame_moves_on_without_being_looked_at_unless_its_moments_are_its_own(
+    both_hands: dict[Side, HandModel], own: bool
+) -> None:
+    stage = replace(
+        ALONE, lrs={"hand.pose": 0.1}, weights={"image": 1.0}, frames_per_step=1, frame_moments=own
+    )
+    poses = []
+    for steps in (1, 2):
+        scene = held_cube(both_hands)
+        run_stage(scene, replace(stage, steps=steps), random_evidence(scene), 0)
+        poses.append(scene.hand_poses["right"].pose[choose_frames(scene.n_frames, stage, 0, 0)])
+    assert torch.any(poses[0] != 0)
+    assert torch.equal(*poses) == own
