@@ -145,49 +145,67 @@ def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np
 
 def _linearise(bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray) -> _System:
     """Normal equations about `bundle`; a pose changes by a turn about the object's origin, and a shift."""
-    cam = _in_camera(bundle)
-    spoke = cam - bundle.transl[bundle.frame]
-    depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
-    zero = np.zeros(len(cam))
-    by_cam = np.stack(
-        [
-            np.stack([K[0, 0] / depth, zero, -K[0, 0] * cam[:, 0] / depth**2], axis=1),
-            np.stack([zero, K[1, 1] / depth, -K[1, 1] * cam[:, 1] / depth**2], axis=1),
-        ],
-        axis=1,
-    )
-    by_turn = -np.einsum("mij,mjk->mik", by_cam, _cross_matrix(spoke))
-    by_pose = np.concatenate([by_turn, by_cam], axis=2)
-    by_point = np.einsum("mij,mjk->mik", by_cam, bundle.rotations[bundle.frame])
-    residual = bundle.residuals(K)
+    residual, rows_pose, rows_point = _jacobians(bundle, K)
     weight = _cauchy((residual**2).sum(1) / config.pixel_sigma**2)[1] / config.pixel_sigma**2
+    root = np.sqrt(weight)[:, None]
+    residual, rows_pose, rows_point = root * residual, root[:, None] * rows_pose, root[:, None] * rows_point
 
     count, frames = len(bundle.points), int(free.sum())
-    weighted_point = weight[:, None, None] * by_point
-    points = _sum_by(bundle.point, np.einsum("mij,mik->mjk", weighted_point, by_point), count)
-    point_gradient = _sum_by(bundle.point, np.einsum("mij,mi->mj", weighted_point, residual), count)
+    points = _sum_by(bundle.point, _products(rows_point, rows_point), count)
+    point_gradient = _sum_by(bundle.point, _products(rows_point, residual[:, :, None])[:, :, 0], count)
 
-    poses = np.zeros((frames, 6, frames, 6))
-    pose_gradient = np.zeros((frames, 6))
     slot = np.cumsum(free) - 1
     moving = np.flatnonzero(free[bundle.frame])
-    row = slot[bundle.frame[moving]]
-    weighted_pose = weight[moving, None, None] * by_pose[moving]
+    # In the order of the coupling's rows.
+    moving = moving[np.lexsort((bundle.point[moving], slot[bundle.frame[moving]]))]
+    row, rows_pose = slot[bundle.frame[moving]], rows_pose[moving]
+    poses = np.zeros((frames, 6, frames, 6))
     diagonal = np.arange(frames)
-    poses[diagonal, :, diagonal, :] = _sum_by(
-        row, np.einsum("mij,mik->mjk", weighted_pose, by_pose[moving]), frames
-    )
-    pose_gradient += _sum_by(row, np.einsum("mij,mi->mj", weighted_pose, residual[moving]), frames)
-    order = np.lexsort((bundle.point[moving], row))
-    blocks = np.einsum("mij,mik->mjk", weighted_pose, by_point[moving])[order]
+    poses[diagonal, :, diagonal, :] = _sum_by(row, _products(rows_pose, rows_pose), frames)
+    pose_gradient = _sum_by(row, _products(rows_pose, residual[moving][:, :, None])[:, :, 0], frames)
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=frames))])
     coupling = scipy.sparse.bsr_matrix(
-        (blocks, bundle.point[moving][order], starts), shape=(6 * frames, 3 * count), blocksize=(6, 3)
+        (_products(rows_pose, rows_point[moving]), bundle.point[moving], starts),
+        shape=(6 * frames, 3 * count),
+        blocksize=(6, 3),
     )
     _add_prior(poses, pose_gradient, bundle, config, free, slot)
     return _System(
         poses.reshape(6 * frames, 6 * frames), points, coupling, pose_gradient.ravel(), point_gradient
     )
+
+
+def _jacobians(bundle: Bundle, K: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reprojection errors [M, 2], and how they change with the pose [M, 2, 6] and the point [M, 2, 3].
+
+    Element by element: products of many small matrices take numpy most of an adjustment's time.
+    """
+    rotation = bundle.rotations[bundle.frame]
+    cam = _in_camera(bundle)
+    right, down, ahead = (cam - bundle.transl[bundle.frame]).T
+    depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
+    slopes = cam[:, :2] / depth[:, None]
+    by_pose, by_point = np.zeros((len(cam), 2, 6)), np.empty((len(cam), 2, 3))
+    for axis in range(2):
+        scale, slope = K[axis, axis] / depth, slopes[:, axis]
+        by_pose[:, axis, 3 + axis] = scale
+        by_pose[:, axis, 5] = -scale * slope
+        by_point[:, axis] = scale[:, None] * (rotation[:, axis] - slope[:, None] * rotation[:, 2])
+    # The spoke from the object's origin to the point, crossed with the row of the shift.
+    scale, slope = K[0, 0] / depth, slopes[:, 0]
+    by_pose[:, 0, :3] = np.stack(
+        [-down * scale * slope, ahead * scale + right * scale * slope, -down * scale], axis=1
+    )
+    scale, slope = K[1, 1] / depth, slopes[:, 1]
+    by_pose[:, 1, :3] = np.stack(
+        [-down * scale * slope - ahead * scale, right * scale * slope, right * scale], axis=1
+    )
+    return slopes * (K[0, 0], K[1, 1]) + K[:2, 2] - bundle.pixels, by_pose, by_point
+
+
+def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The transposes of `left` [M, 2, A] times `right` [M, 2, B]: [M, A, B]."""
+    return left[:, 0, :, None] * right[:, 0, None, :] + left[:, 1, :, None] * right[:, 1, None, :]
 
 
 def _add_prior(
@@ -251,13 +269,6 @@ def _reduced(system: _System, damping: float) -> tuple[np.ndarray, scipy.sparse.
         blocksize=(6, 3),
     )
     return poses - (scaled @ coupling.T).toarray(), scaled, inverse
-
-
-def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
-    """[M, 3, 3] matrices of the cross product with `vectors` [M, 3] on the left."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
