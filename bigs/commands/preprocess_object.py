@@ -165,7 +165,7 @@ def _report_table(report: SfmReport) -> dict[str, Any]:
             "model": int(report.model[t]),
             "sightings": int(checks.sightings[t]),
             "uncertainty_degrees": round(float(checks.uncertainty[t]), 3),
-            "mirror_ratio": round(float(checks.mirror[t]), 3),
+            "mirror_evidence": round(float(checks.mirror[t]), 1),
             "turn_cosine": round(float(checks.cosine[t]), 3),
             "flags": checks.flags[t],
         }

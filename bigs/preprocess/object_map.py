@@ -83,12 +83,23 @@ class ObjectMap:
 
         Counted are the tracks that could have a point: those with `least_sightings` in posed frames.
         """
+        _, error = self._errors()
+        return float((error**2).mean()) if len(error) else np.inf
+
+    def losses(self) -> np.ndarray:
+        """Geman-McClure losses of the same sightings, added up by track [N]; 1 for one that fits nowhere."""
+        track, error = self._errors()
+        squared = (error / (0.25 * self.config.keep_error)) ** 2
+        return np.bincount(track, squared / (1.0 + squared), minlength=len(self.points))
+
+    def _errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Tracks and errors [M] in pixels, at most `keep_error`, of the sightings that `misfit` counts."""
         rows = self.posed[self.frame]
         seen = np.bincount(self.track[rows], minlength=len(self.points))
         rows &= seen[self.track] >= self.config.least_sightings
         error = np.linalg.norm(self.reproject(rows) - self.pixels[rows], axis=1)
         error[~self.known[self.track[rows]]] = np.inf
-        return float((np.minimum(error, self.config.keep_error) ** 2).mean()) if len(error) else np.inf
+        return self.track[rows], np.minimum(error, self.config.keep_error)
 
     def use(self) -> np.ndarray:
         """Sightings [M] (bool) of known points, believed, in frames with a pose."""
@@ -153,6 +164,12 @@ class ObjectMap:
         self.good[rows] = error < self.config.keep_error
         seen = np.bincount(self.track[self.use()], minlength=len(self.points))
         self.known &= seen >= 2
+
+    def replace_sightings(self, frame: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> None:
+        """Take other sightings instead: [M], [M] and [M, 2]. They are no features, so `search` knows none."""
+        self.frame, self.track, self.pixels = frame, track, pixels
+        self.feature = np.full(len(frame), -1)
+        self.good = np.ones(len(frame), dtype=bool)
 
     def bundle(self, frames: np.ndarray) -> tuple[Bundle, np.ndarray]:
         """Consecutive `frames` with what they see, and the tracks [n] that its points belong to."""

@@ -16,6 +16,7 @@ from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_f
 from bigs.preprocess.sfm_grow import GrowConfig, grow
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
 from bigs.preprocess.sfm_models import Mapping, MappingConfig, frame_pairs, map_features
+from bigs.preprocess.sfm_patches import PatchConfig, Pictures, sharpen
 from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
 from bigs.preprocess.sfm_refine import RefineConfig, refine
 from bigs.preprocess.sfm_seed import Seed, find_seed
@@ -33,6 +34,7 @@ class SfmConfig:
     map: MapConfig = field(default_factory=MapConfig)
     grow: GrowConfig = field(default_factory=GrowConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
+    patches: PatchConfig = field(default_factory=PatchConfig)
     checks: CheckConfig = field(default_factory=CheckConfig)
     # How many partial models are tried as the start before the best outcome is taken.
     seeds: int = 3
@@ -120,7 +122,8 @@ def structure_from_motion(
     K = K.copy()
     K[0, 0], K[1, 1] = mapping.focal, mapping.focal * K[1, 1] / K[0, 0]
     tracks = join_matches(mapping.matches, [len(frame.pixels) for frame in features])
-    attempt, tried = _best_attempt(features, tracks, mapping, K, config)
+    pictures = Pictures(images[clip], object_masks, config.patches)
+    attempt, tried = _best_attempt(features, tracks, pictures, mapping, K, config)
     report = _report(attempt, tried, mapping, features, (first, len(masks) - last))
     return _result(attempt.map, report, images[clip], first, config), report
 
@@ -162,7 +165,12 @@ def _map(
 
 
 def _best_attempt(
-    features: Sequence[FrameFeatures], tracks: Tracks, mapping: Mapping, K: np.ndarray, config: SfmConfig
+    features: Sequence[FrameFeatures],
+    tracks: Tracks,
+    pictures: Pictures,
+    mapping: Mapping,
+    K: np.ndarray,
+    config: SfmConfig,
 ) -> tuple[_Attempt, int]:
     """Start from one model after another until nothing serious is found; the best fit counts."""
     best: _Attempt | None = None
@@ -173,10 +181,11 @@ def _best_attempt(
         if seed is None or not map_.use().any():
             continue
         tried += 1
-        grow(map_, config.grow)
+        grow(map_, mapping.models, config.grow)
         map_, misfit = refine(map_, tracks, mapping.models, seed.frames, config.refine)
         if not map_.use().any():
             continue
+        sharpen(map_, pictures, config.patches)
         checks = check_map(map_, features, tracks, mapping.models, config.checks)
         attempt = _Attempt(map_, seed, number, checks, misfit)
         if best is None or attempt.misfit < config.clearly_better * best.misfit:

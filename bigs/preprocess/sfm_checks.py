@@ -18,7 +18,7 @@ from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_features import FrameFeatures
 from bigs.preprocess.sfm_models import PartialModel
 from bigs.preprocess.sfm_refine import disagreement
-from bigs.preprocess.sfm_seed import mirror_misfits, mirrored
+from bigs.preprocess.sfm_seed import mirror_evidence, mirrored
 from bigs.preprocess.tracks import Tracks
 
 
@@ -35,8 +35,9 @@ class CheckConfig:
     # A step that is longer than this many usual ones, and than this angle, degrees.
     long_step: float = 2.0
     least_long_step: float = 8.0
-    # Misfit over that of the mirror image in depth. Right segments reached 0.97 where little was seen.
-    mirror_share: float = 0.975
+    # Standard deviations by which a segment must fit better than its mirror image in depth. Right ones had
+    # 3.5 and more where little was seen, reversed ones 0 and less, and bent ones 1 to 2.
+    least_evidence: float = 2.5
     # A partial model's turns that differ from the map's by more than this, degrees.
     most_disagreement: float = 5.0
     # Frames that are compared with their mirror image together, half of them with the next ones too.
@@ -48,7 +49,7 @@ class SfmChecks(NamedTuple):
 
     sightings: np.ndarray  # [T] believed sightings of points
     uncertainty: np.ndarray  # [T] degrees against the frame that most others are tied to
-    mirror: np.ndarray  # [T] misfit over that of the mirror image, the worst window's; above 1 is wrong
+    mirror: np.ndarray  # [T] evidence against the mirror image, the worst window's; below 0 is wrong
     cosine: np.ndarray  # [T] of angular velocity before and after; 1 where nothing turns
     flags: list[list[str]]  # T lists of plain words; empty where nothing is wrong
 
@@ -84,7 +85,7 @@ def check_map(
     # Of two parts that hang together loosely the larger one is believed.
     tied = (between <= config.most_uncertain).sum(1)
     uncertainty = between[max(range(frames), key=lambda t: (tied[t], sightings[t]))]
-    mirror = _mirror_ratios(map_, features, tracks, config.mirror_window)
+    mirror = _mirror_evidence(map_, features, tracks, config.mirror_window)
     cosine = turn_cosines(map_.rotations)
     steps = _step_angles(map_.rotations)
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -102,7 +103,7 @@ def check_map(
     signs = {
         FEW: sightings < config.least_sightings,
         LOOSE: uncertainty > config.most_uncertain,
-        REVERSED: mirror > config.mirror_share,
+        REVERSED: mirror < config.least_evidence,
         TURN: cosine < config.least_cosine,
         STEP: long_step,
         OTHERWISE: otherwise,
@@ -131,20 +132,17 @@ def _step_angles(rotations: np.ndarray) -> np.ndarray:
     return np.degrees(steps.magnitude())
 
 
-def _mirror_ratios(
+def _mirror_evidence(
     map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, window: int
 ) -> np.ndarray:
-    """For each frame, the largest over windows of own misfit over the mirror image's."""
+    """For each frame, the least over windows of the evidence against the mirror image."""
     frames = len(map_.posed)
-    ratios = np.zeros(frames)
+    evidence = np.full(frames, np.inf)
     trial = ObjectMap(features, tracks, map_.K, MapConfig())
-    starts = range(0, max(frames - window // 2, 1), max(window // 2, 1))
-    for start in starts:
+    for start in range(0, max(frames - window // 2, 1), max(window // 2, 1)):
         inside = np.arange(start, min(start + window, frames))
         if len(inside) < 3:
             continue
         trial.rotations[:], trial.transl[:] = map_.rotations, map_.transl
-        own, mirrored = mirror_misfits(trial, inside)
-        if np.isfinite(own) and np.isfinite(mirrored) and mirrored > 0:
-            ratios[inside] = np.maximum(ratios[inside], own / mirrored)
-    return ratios
+        evidence[inside] = np.minimum(evidence[inside], mirror_evidence(trial, inside))
+    return evidence

@@ -7,12 +7,16 @@ the motion prior while few are left; points that come into view are placed from 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bigs.preprocess.bundle import BundleConfig
 from bigs.preprocess.object_map import ObjectMap
+from bigs.preprocess.sfm_models import PartialModel
+from bigs.preprocess.sfm_refine import joined
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,12 @@ class GrowConfig:
     shift_sigma: float = 0.003
 
 
-def grow(map_: ObjectMap, config: GrowConfig) -> None:
-    """Give every frame of the clip a pose, in place: next comes the one that sees most known points."""
+def grow(map_: ObjectMap, models: Sequence[PartialModel], config: GrowConfig) -> None:
+    """Give every frame of the clip a pose, in place: next comes the one that sees most known points.
+
+    `models` are partial models, which may know how a frame is turned against the one before where the motion
+    does not go on as it was: after a pause, say.
+    """
     fine = replace(
         map_.config.bundle,
         turn_sigma=config.turn_sigma,
@@ -42,11 +50,18 @@ def grow(map_: ObjectMap, config: GrowConfig) -> None:
     )
     while not map_.posed.all():
         t, towards = _next_frame(map_)
-        _predict(map_, t, towards, config.memory)
+        starts = [
+            _predicted(map_, t, towards, config.memory),
+            # At rest, as where a motion turns back: going on leads astray there.
+            (map_.rotations[t - towards].copy(), map_.transl[t - towards].copy()),
+            *as_models_say(map_, t, towards, models),
+        ]
         map_.posed[t] = True
-        map_.search(t)
         frames, free = _window(map_, t, towards, config)
-        map_.adjust(frames, free & (frames == t), replace(fine, pixel_sigma=config.coarse_sigma))
+        coarse = replace(fine, pixel_sigma=config.coarse_sigma)
+        map_.rotations[t], map_.transl[t] = best_start(map_, t, frames, starts, coarse)
+        map_.search(t)
+        map_.adjust(frames, free & (frames == t), coarse)
         map_.judge()
         map_.search(t)
         map_.adjust(frames, free, fine)
@@ -67,7 +82,10 @@ def _next_frame(map_: ObjectMap) -> tuple[int, int]:
     return int(t), step
 
 
-def _predict(map_: ObjectMap, t: int, step: int, memory: int) -> None:
+_Pose = tuple[np.ndarray, np.ndarray]  # [3, 3] and [3]
+
+
+def _predicted(map_: ObjectMap, t: int, step: int, memory: int) -> _Pose:
     """The pose of frame `t` if the object goes on as in the frames before it (or after it)."""
     before = [t - step]
     while len(before) <= memory and (
@@ -76,12 +94,40 @@ def _predict(map_: ObjectMap, t: int, step: int, memory: int) -> None:
         before.append(before[-1] - step)
     last = before[0]
     if len(before) == 1:
-        map_.rotations[t], map_.transl[t] = map_.rotations[last], map_.transl[last]
-        return
+        return map_.rotations[last], map_.transl[last]
     steps = len(before) - 1
     turns = Rotation.from_matrix(map_.rotations[before[:-1]] @ map_.rotations[before[1:]].transpose(0, 2, 1))
-    map_.rotations[t] = Rotation.from_rotvec(turns.as_rotvec().mean(0)).as_matrix() @ map_.rotations[last]
-    map_.transl[t] = map_.transl[last] + (map_.transl[last] - map_.transl[before[-1]]) / steps
+    turn = Rotation.from_rotvec(turns.as_rotvec().mean(0)).as_matrix()
+    return turn @ map_.rotations[last], map_.transl[last] + (
+        map_.transl[last] - map_.transl[before[-1]]
+    ) / steps
+
+
+def as_models_say(map_: ObjectMap, t: int, step: int, models: Sequence[PartialModel]) -> list[_Pose]:
+    """The pose of frame `t` by each partial model that has it and the frame it is reached from."""
+    starts = []
+    for model in models:
+        rows = [np.flatnonzero(model.frames == frame) for frame in (t - step, t)]
+        if all(len(row) for row in rows):
+            rotations, transl = joined(map_, model, np.concatenate(rows))
+            starts.append((rotations[t], transl[t]))
+    return starts
+
+
+def best_start(
+    map_: ObjectMap, t: int, frames: np.ndarray, starts: Sequence[_Pose], coarse: BundleConfig
+) -> _Pose:
+    """The start of frame `t` from which most sightings of known points are met; of equals the first."""
+    rows = map_.good & map_.known[map_.track] & (map_.frame == t)
+    points = map_.points.copy()
+    met = []
+    for rotation, transl in starts:
+        map_.rotations[t], map_.transl[t] = rotation, transl
+        map_.adjust(frames, frames == t, coarse)
+        error = np.linalg.norm(map_.reproject(rows) - map_.pixels[rows], axis=1)
+        met.append(int((error < map_.config.keep_error).sum()))
+        map_.points = points.copy()
+    return starts[int(np.argmax(met))]
 
 
 def _window(map_: ObjectMap, t: int, step: int, config: GrowConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -134,10 +134,10 @@ def splices(
         order = rows[np.argsort(away, kind="stable")]
         for depth in config.depths:
             if depth < len(order):
-                yield Splice(model, *_joined(map_, model, order[depth:]))
+                yield Splice(model, *joined(map_, model, order[depth:]))
 
 
-def _joined(map_: ObjectMap, model: PartialModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def joined(map_: ObjectMap, model: PartialModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The map's poses with those of `model`'s frames `rows`, in the map's frame and size.
 
     At the first of `rows` both agree in pose and in the depth of the object's middle.

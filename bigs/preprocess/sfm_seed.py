@@ -75,15 +75,19 @@ def smooth_run(frames: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     return np.flatnonzero(piece == np.bincount(piece).argmax())
 
 
-def mirror_misfits(map_: ObjectMap, frames: np.ndarray) -> tuple[float, float]:
-    """How badly consecutive `frames`, adjusted by themselves, fit as they are and mirrored in depth.
+def mirror_evidence(map_: ObjectMap, frames: np.ndarray) -> float:
+    """By how many standard deviations consecutive `frames` fit better than their mirror image in depth.
 
-    `map_` is changed; give a copy.
+    Both are adjusted by themselves, and the tracks' losses compared one by one: what fits neither image, as
+    many sightings do on plain objects, says nothing, and many tracks that say a little say it surely. 0 if
+    no track fits either. `map_` is changed; give a copy.
     """
     rotations, transl = map_.rotations[frames].copy(), map_.transl[frames].copy()
-    misfits = []
+    losses = []
     for turned in (rotations, mirrored(rotations)):
         map_.restart(frames, turned, transl)
         map_.settle()
-        misfits.append(map_.misfit())
-    return misfits[0], misfits[1]
+        losses.append(map_.losses())
+    better = losses[1] - losses[0]
+    spread = float(np.linalg.norm(better))
+    return float(better.sum()) / spread if spread > 0 else 0.0

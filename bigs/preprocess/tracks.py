@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 
 class Tracks(NamedTuple):
@@ -20,7 +18,10 @@ class Tracks(NamedTuple):
 
 
 def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence[int]) -> Tracks:
-    """Connected components of matches; where one holds several features of a frame, those are left out.
+    """Sightings joined along matches, those of near frames first.
+
+    A match that would bring two features of a frame into one track is wrong, or one of the matches before it
+    was; it is left out.
 
     Args:
         matches: of pairs of frames, each [n, 2] feature numbers.
@@ -29,17 +30,26 @@ def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence
     Returns:
         Tracks of two sightings or more.
     """
-    first = np.concatenate([[0], np.cumsum(counts)])
-    pairs = [pair + first[[a, b]] for (a, b), pair in matches.items() if len(pair)]
-    edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=int)
-    graph = scipy.sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(first[-1], first[-1]))
-    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    first = np.concatenate([[0], np.cumsum(counts)]).tolist()
     frame = np.repeat(np.arange(len(counts)), counts)
-    feature = np.arange(first[-1]) - first[frame]
-    _, place, again = np.unique(label * len(counts) + frame, return_inverse=True, return_counts=True)
-    alone = again[place] == 1
-    # Only sightings that stay count towards a track's length.
-    length = np.bincount(label[alone], minlength=label.max(initial=-1) + 1)
-    keep = alone & (length[label] >= 2)
+    root = list(range(first[-1]))
+    # The frames that each root's track has, a bit for each.
+    shown = [1 << t for t in frame.tolist()]
+
+    def find(i: int) -> int:
+        while root[i] != i:
+            root[i] = root[root[i]]
+            i = root[i]
+        return i
+
+    for a, b in sorted(matches, key=lambda pair: (pair[1] - pair[0], pair)):
+        for i, j in matches[a, b].tolist():
+            left, right = find(first[a] + i), find(first[b] + j)
+            if not shown[left] & shown[right]:
+                root[right] = left
+                shown[left] |= shown[right]
+    label = np.array([find(i) for i in range(first[-1])], dtype=int)
+    keep = np.bincount(label, minlength=len(label))[label] >= 2
     _, track = np.unique(label[keep], return_inverse=True)
+    feature = np.arange(first[-1]) - np.asarray(first)[frame]
     return Tracks(frame[keep], feature[keep], track, int(track.max(initial=-1)) + 1)

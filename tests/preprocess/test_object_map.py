@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,7 +20,7 @@ from bigs.preprocess.sfm_checks import (
     check_map,
     turn_cosines,
 )
-from bigs.preprocess.sfm_grow import GrowConfig, grow
+from bigs.preprocess.sfm_grow import GrowConfig, as_models_say, best_start, grow
 from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, splices
 from bigs.preprocess.sfm_seed import find_seed, smooth_run
 from bigs.preprocess.tracks import join_matches
@@ -46,10 +48,10 @@ def test_matches_join_into_tracks() -> None:
     assert found == {((0, 0), (1, 2), (2, 1)), ((1, 0), (2, 0))}
 
 
-def test_two_features_of_a_frame_are_not_one_point() -> None:
-    matches = {(0, 1): np.array([[0, 0]]), (1, 2): np.array([[0, 0]]), (0, 2): np.array([[1, 0]])}
+def test_two_features_of_a_frame_are_not_one_point_and_near_frames_are_believed_first() -> None:
+    matches = {(0, 2): np.array([[1, 0]]), (0, 1): np.array([[0, 0]]), (1, 2): np.array([[0, 0]])}
     tracks = join_matches(matches, [2, 1, 1])
-    assert list(tracks.frame) == [1, 2]
+    assert list(tracks.frame) == [0, 1, 2] and list(tracks.feature) == [0, 0, 0] and tracks.total == 1
 
 
 def test_no_matches_give_no_tracks() -> None:
@@ -77,11 +79,53 @@ def test_growth_crosses_frames_that_show_next_to_nothing() -> None:
     egg = turning_object(hidden=(24, 25), shown_there=5, seed=1)
     found = egg.map()
     assert find_seed(found, egg.model(range(4, 22))) is not None
-    grow(found, GrowConfig())
+    grow(found, (), GrowConfig())
     polish(found, 2)
     errors = rotation_errors(found.rotations, egg.rotations)
     assert np.median(errors) < 0.5 and np.percentile(errors, 90) < 1.5
     assert np.bincount(found.frame[found.use()], minlength=40)[26:].min() > 50
+
+
+def replayed(egg: TurningObject, order: np.ndarray) -> TurningObject:
+    """The egg's frames in another order, each with noise of its own."""
+    rng = np.random.default_rng(3)
+    features = [
+        egg.features[t]._replace(
+            pixels=egg.features[t].pixels + 0.1 * rng.standard_normal(egg.features[t].pixels.shape)
+        )
+        for t in order
+    ]
+    return TurningObject(
+        egg.rotations[order], egg.transl[order], egg.points, features, [egg.ids[t] for t in order]
+    )
+
+
+def test_growth_follows_a_motion_that_goes_back() -> None:
+    """Where few points show, going on as before led to a map that turns on for ever."""
+    order = np.concatenate([np.arange(24), np.arange(22, 2, -1)])
+    egg = replayed(turning_object(points=120, noise=0.3, speed=9.0), order)
+    found = egg.map()
+    assert find_seed(found, egg.model(range(2, 14))) is not None
+    grow(found, (), GrowConfig())
+    polish(found, 2)
+    assert rotation_errors(found.rotations, egg.rotations).max() < 2.0
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_growth_knows_of_a_jump_by_a_partial_model(egg: TurningObject, step: int) -> None:
+    """Whatever the model's frame and unit; and the start that the sightings meet is taken."""
+    found = at_truth(egg)
+    t, last = 20, 20 - step
+    (start,) = as_models_say(found, t, step, (egg.model(range(5, 35)), egg.model(range(20, 21))))
+    assert np.allclose(start[0], egg.rotations[t], atol=1e-9)
+    assert np.allclose(start[1], egg.transl[t], atol=2e-3)
+    wrong = egg.rotations[last] @ Rotation.from_euler("y", 40.0, degrees=True).as_matrix()
+    found.rotations[t], found.transl[t] = wrong, egg.transl[last]
+    frames = np.arange(14, 27)
+    starts = [(wrong, egg.transl[last]), start, (egg.rotations[last], egg.transl[last])]
+    # With one step of adjustment not every start gets there.
+    one_step = replace(found.config.bundle, pixel_sigma=2.0, iterations=1)
+    assert best_start(found, t, frames, starts, one_step) is start
 
 
 def test_the_search_finds_points_that_were_never_matched(egg: TurningObject) -> None:
@@ -103,7 +147,7 @@ def test_frames_without_a_known_point_are_left_where_they_are(egg: TurningObject
 def test_nothing_is_flagged_where_nothing_is_wrong(egg: TurningObject) -> None:
     checks = check_map(at_truth(egg), egg.features, egg.tracks(), (), CheckConfig())
     assert not any(checks.flags)
-    assert checks.mirror.max() < 0.9
+    assert checks.mirror.min() > 5.0
 
 
 def test_a_reversed_segment_is_flagged(egg: TurningObject) -> None:

@@ -1,0 +1,131 @@
+"""Points measured by their patches, on rendered pictures of a textured egg whose poses are exact."""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from turning_object import AXES, K, TurningObject, rotation_errors, turning_object
+
+from bigs.preprocess.object_map import MapConfig, ObjectMap
+from bigs.preprocess.sfm_patches import PatchConfig, Pictures, sharpen
+
+HEIGHT, WIDTH = 360, 480
+
+
+class Filmed(NamedTuple):
+    """An egg, its pictures, and the map that its features give at disturbed poses."""
+
+    egg: TurningObject
+    images: list[np.ndarray]
+    masks: np.ndarray
+    map: ObjectMap
+
+
+def _picture(rotation: np.ndarray, transl: np.ndarray, light: float) -> tuple[np.ndarray, np.ndarray]:
+    """The egg with a texture of waves in space, [H, W, 3] uint8, and where it is [H, W]."""
+    row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones_like(row)], axis=-1)
+    eye, ray = -(rotation.T @ transl) / AXES, (rays @ rotation) / AXES
+    a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1.0
+    root = b**2 - a * c
+    on = root > 0
+    depth = (-b - np.sqrt(root.clip(0.0))) / a
+    place = (eye + depth[..., None] * ray) * AXES
+    rng = np.random.default_rng(4)
+    waves = rng.standard_normal((40, 3))
+    waves *= (2.0 * np.pi / rng.uniform(0.007, 0.03, 40) / np.linalg.norm(waves, axis=1))[:, None]
+    texture = np.sin(place @ waves.T + rng.uniform(0.0, 6.0, 40)).sum(-1) / np.sqrt(40.0)
+    grey = np.where(on, light * (120.0 + 50.0 * texture), 30.0)
+    return np.repeat(grey.round().clip(0, 255).astype(np.uint8)[..., None], 3, axis=2), on
+
+
+@pytest.fixture(scope="module")
+def filmed() -> Filmed:
+    """24 frames; no track is longer than four, so that the map is a chain of short links."""
+    egg = turning_object(frames=24, points=500, noise=0.3)
+    pictures = [
+        _picture(rotation, transl, 1.0 - 0.01 * t)
+        for t, (rotation, transl) in enumerate(zip(egg.rotations, egg.transl, strict=True))
+    ]
+    whole = egg.tracks()
+    _, piece = np.unique(whole.track * 24 + (whole.frame + whole.track) // 4, return_inverse=True)
+    tracks = whole._replace(track=piece, total=int(piece.max()) + 1)
+    map_ = ObjectMap(egg.features, tracks, K, MapConfig())
+    # A bend as drift makes it: a turn that grows along the clip.
+    bend = Rotation.from_rotvec(np.linspace(-1.5, 1.5, 24)[:, None] * [0.0, 1.0, 0.4], degrees=True)
+    map_.restart(np.arange(24), egg.rotations @ bend.as_matrix(), egg.transl)
+    map_.settle()
+    return Filmed(egg, [image for image, _ in pictures], np.stack([on for _, on in pictures]), map_)
+
+
+def test_poses_and_points_get_better(filmed: Filmed) -> None:
+    egg, found = filmed.egg, copy.deepcopy(filmed.map)
+    before = rotation_errors(found.rotations, egg.rotations)
+    sightings = found.use().sum()
+    sharpen(found, Pictures(filmed.images, filmed.masks, PatchConfig()), PatchConfig())
+    after = rotation_errors(found.rotations, egg.rotations)
+    assert np.median(after) < 0.4 * np.median(before) and after.max() < before.max()
+    assert found.use().sum() > 1.2 * sightings
+
+
+def test_every_sighting_is_on_the_object_and_stands_for_one_point(filmed: Filmed) -> None:
+    masks = filmed.masks.copy()
+    masks[10:14, :, : WIDTH // 2] = False  # a hand over the left half
+    found = copy.deepcopy(filmed.map)
+    found.good[np.isin(found.frame, np.arange(10, 14)) & (found.pixels[:, 0] < WIDTH // 2)] = False
+    sharpen(found, Pictures(filmed.images, masks, PatchConfig()), PatchConfig())
+    use = found.use()
+    column, row = found.pixels[use].astype(int).T
+    assert masks[found.frame[use], row, column].mean() > 0.99
+    pairs = np.stack([found.frame[use], found.track[use]])
+    assert np.unique(pairs, axis=1).shape[1] == use.sum()
+    # Points are seen again after the hand.
+    before, after = (found.track[use & there] for there in (found.frame < 10, found.frame >= 14))
+    assert len(np.intersect1d(before, after)) > 50
+
+
+def test_pictures_of_something_else_leave_the_matches_in_force(filmed: Filmed) -> None:
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, image.shape, dtype=np.uint8) for image in filmed.images]
+    found = copy.deepcopy(filmed.map)
+    before, sightings = found.rotations.copy(), found.use().sum()
+    sharpen(found, Pictures(noise, filmed.masks, PatchConfig()), PatchConfig())
+    assert found.use().sum() > 0.9 * sightings
+    assert rotation_errors(found.rotations, before).max() < 0.5
+
+
+@pytest.mark.parametrize("grey", [0, 128])
+def test_even_pictures_leave_the_matches_in_force(filmed: Filmed, grey: int) -> None:
+    even = [np.full_like(image, grey) for image in filmed.images]
+    found = copy.deepcopy(filmed.map)
+    before = found.rotations.copy()
+    sharpen(found, Pictures(even, filmed.masks, PatchConfig()), PatchConfig())
+    assert np.isfinite(found.rotations).all()
+    assert rotation_errors(found.rotations, before).max() < 0.5
+
+
+def test_large_pictures_are_shrunk_and_measured_in_their_own_pixels(filmed: Filmed) -> None:
+    small = PatchConfig(max_side=150)
+    pictures = Pictures(filmed.images, filmed.masks, small)
+    assert pictures.shrunk > 1
+    pixels = np.array([[250.3, 170.9], [201.0, 222.2]])
+    assert np.allclose(pictures.pixels(3, pictures.places(3, pixels)), pixels, atol=1e-3)
+    found = copy.deepcopy(filmed.map)
+    before = rotation_errors(found.rotations, filmed.egg.rotations)
+    sharpen(found, pictures, small)
+    after = rotation_errors(found.rotations, filmed.egg.rotations)
+    assert np.median(after) < 0.6 * np.median(before)
+
+
+def test_frames_without_the_object_are_no_hindrance(filmed: Filmed) -> None:
+    masks = filmed.masks.copy()
+    masks[5] = False
+    found = copy.deepcopy(filmed.map)
+    found.good[found.frame == 5] = False
+    sharpen(found, Pictures(filmed.images, masks, PatchConfig()), PatchConfig())
+    assert not (found.use() & (found.frame == 5)).any()
+    assert np.isfinite(found.transl).all()
