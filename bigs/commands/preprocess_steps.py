@@ -48,8 +48,8 @@ from bigs.preprocess.landmarker import find_keypoints
 from bigs.preprocess.mask_checks import check_masks
 from bigs.preprocess.masks import MaskSource, open_masks, write_masks
 from bigs.preprocess.sam2 import load_sam2, no_weights, segment_clip
-from bigs.preprocess.silhouette_points import SilhouettePointsConfig, complete_points
 from bigs.preprocess.source import open_source
+from bigs.preprocess.surface_points import SurfacePointsConfig, complete_points
 from bigs.preprocess.words import frame_ranges
 from bigs.types import Side
 
@@ -192,7 +192,7 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     count = len(frames.names)
     stamp, picture = processed / BUILD_FILE, processed / "build.png"
     parts = [processed / name for name in (FRAMES_FILE, MASKS, HANDS_FILE, SFM_FILE, ALIGNED_FILE)]
-    config = SilhouettePointsConfig()
+    config = SurfacePointsConfig()
     inputs = content_digest(*parts, frames.K, _model_identity(request), asdict(config))
     ours = stamp.exists()
     if request.state(stamp, inputs) == "current" and (request.clip / "build" / "data.npy").is_file():

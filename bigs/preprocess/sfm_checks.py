@@ -17,7 +17,7 @@ from bigs.preprocess.bundle import turn_uncertainties
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_features import FrameFeatures
 from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_refine import disagreement
+from bigs.preprocess.sfm_refine import disagreement, smooth_parts
 from bigs.preprocess.sfm_seed import mirror_evidence, mirrored
 from bigs.preprocess.tracks import Tracks
 
@@ -93,13 +93,13 @@ def check_map(
     for t in np.flatnonzero(steps > max(config.long_step * usual, config.least_long_step)):
         long_step[t : t + 2] = True
     otherwise = np.zeros(frames, dtype=bool)
-    for model in models:
-        rows, degrees = disagreement(map_.rotations, model)
+    for part in smooth_parts(models):
+        degrees = disagreement(map_.rotations, part)
         # A model that is the map's mirror image in depth is one more start that came out reversed: which of
         # the two is right, perspective tells.
-        image = model._replace(rotations=mirrored(model.rotations))
-        if disagreement(map_.rotations, image)[1].max(initial=0.0) > config.most_disagreement:
-            otherwise[model.frames[rows[degrees > config.most_disagreement]]] = True
+        image = part._replace(rotations=mirrored(part.rotations))
+        if disagreement(map_.rotations, image).max() > config.most_disagreement:
+            otherwise[part.frames[degrees > config.most_disagreement]] = True
     signs = {
         FEW: sightings < config.least_sightings,
         LOOSE: uncertainty > config.most_uncertain,

@@ -52,8 +52,9 @@ def grow(map_: ObjectMap, models: Sequence[PartialModel], config: GrowConfig) ->
         t, towards = _next_frame(map_)
         starts = [
             _predicted(map_, t, towards, config.memory),
-            # At rest, as where a motion turns back: going on leads astray there.
+            # Where a motion turns back, going on leads astray.
             (map_.rotations[t - towards].copy(), map_.transl[t - towards].copy()),
+            _turned_back(map_, t, towards),
             *as_models_say(map_, t, towards, models),
         ]
         map_.posed[t] = True
@@ -103,6 +104,13 @@ def _predicted(map_: ObjectMap, t: int, step: int, memory: int) -> _Pose:
     ) / steps
 
 
+def _turned_back(map_: ObjectMap, t: int, step: int) -> _Pose:
+    """The pose of frame `t` if it is that of the last frame but one, and else that of the last."""
+    two = t - 2 * step
+    last = two if 0 <= two < len(map_.posed) and map_.posed[two] else t - step
+    return map_.rotations[last].copy(), map_.transl[last].copy()
+
+
 def as_models_say(map_: ObjectMap, t: int, step: int, models: Sequence[PartialModel]) -> list[_Pose]:
     """The pose of frame `t` by each partial model that has it and the frame it is reached from."""
     starts = []
@@ -117,17 +125,21 @@ def as_models_say(map_: ObjectMap, t: int, step: int, models: Sequence[PartialMo
 def best_start(
     map_: ObjectMap, t: int, frames: np.ndarray, starts: Sequence[_Pose], coarse: BundleConfig
 ) -> _Pose:
-    """The start of frame `t` from which most sightings of known points are met; of equals the first."""
+    """The start of frame `t` from which the sightings of known points fit best; of equals the first.
+
+    Fit is counted by a loss that is fine about small errors: a side that is seen face on looks nearly the
+    same whichever way it turns from there.
+    """
     rows = map_.good & map_.known[map_.track] & (map_.frame == t)
     points = map_.points.copy()
-    met = []
+    losses = []
     for rotation, transl in starts:
         map_.rotations[t], map_.transl[t] = rotation, transl
         map_.adjust(frames, frames == t, coarse)
-        error = np.linalg.norm(map_.reproject(rows) - map_.pixels[rows], axis=1)
-        met.append(int((error < map_.config.keep_error).sum()))
+        squared = ((map_.reproject(rows) - map_.pixels[rows]) ** 2).sum(1)
+        losses.append((squared / (squared + coarse.pixel_sigma**2)).sum())
         map_.points = points.copy()
-    return starts[int(np.argmax(met))]
+    return starts[int(np.argmin(losses))]
 
 
 def _window(map_: ObjectMap, t: int, step: int, config: GrowConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -84,11 +84,13 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
 class Pictures:
     """The object's crop of every frame in grey, and where in it the object is."""
 
-    def __init__(self, images: Sequence[np.ndarray], masks: np.ndarray, config: PatchConfig) -> None:
-        """T arrays [H, W, 3] uint8, and the object's pixels in them [T, H, W] (bool)."""
+    def __init__(
+        self, images: Sequence[np.ndarray], masks: np.ndarray, config: PatchConfig, coarser: int = 1
+    ) -> None:
+        """T arrays [H, W, 3] uint8, and the object's pixels in them [T, H, W] (bool), shrunk by `coarser`."""
         boxes = [crop_box(mask) or (0, 1, 0, 1) for mask in masks]
         longest = max(max(box[1] - box[0], box[3] - box[2]) for box in boxes)
-        self.shrunk = -(-longest // config.max_side)
+        self.shrunk = coarser * -(-longest // config.max_side)
         self.corners = np.array([(left, top) for top, _, left, _ in boxes], dtype=np.float64)
         self._crops = []
         for image, mask, (top, bottom, left, right) in zip(images, masks, boxes, strict=True):
@@ -117,7 +119,7 @@ class Pictures:
         return self.shrunk * places.double().numpy() + self.corners[t]
 
 
-class _Templates(NamedTuple):
+class Templates(NamedTuple):
     """Patches as their own frames show them."""
 
     grey: torch.Tensor  # [N, S]
@@ -146,8 +148,8 @@ def _measured(
     order = np.lexsort((facing, point))
     frontal = order[np.append(np.flatnonzero(np.diff(point[order])), len(order) - 1)]
     own, middle = frame[frontal], pixels[frontal]
-    offsets = _offsets(config)
-    templates = _templates(pictures, own, middle, offsets, config)
+    offsets = patch_offsets(config)
+    templates = cut_templates(pictures, own, middle, offsets, config)
     whole = (templates.weight > 0).float().mean(1).numpy() > config.least_shown
     whole &= facing[frontal] > config.least_cosine
 
@@ -157,27 +159,24 @@ def _measured(
         cosine = (view * normals).sum(1) / np.linalg.norm(view, axis=1)
         rows = np.flatnonzero(whole & (cosine > config.least_cosine) & (own != t))
         start, warp = _warps(map_, t, own[rows], points[rows], normals[rows])
-        places, fits = _laid(
-            pictures, t, start, warp, _Templates(*(part[rows] for part in templates)), config
-        )
-        rows, places = rows[fits], places[fits]
+        laid = lay(pictures, t, start, warp, Templates(*(part[rows] for part in templates)), config)
         here = np.flatnonzero(whole & (own == t))
-        rows = np.concatenate([rows, here])
-        at = np.concatenate([pictures.pixels(t, places), middle[here]])
+        at = np.concatenate([laid.pixels[laid.fits], middle[here]])
+        rows = np.concatenate([rows[laid.fits], here])
         found.append(Sightings(np.full(len(rows), t), tracks[rows], at))
     return Sightings(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
-def _offsets(config: PatchConfig) -> torch.Tensor:
+def patch_offsets(config: PatchConfig) -> torch.Tensor:
     """Places of a patch about its middle [S, 2]."""
     line = torch.arange(-config.half, config.half + 1, dtype=torch.float32)
     row, column = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([column.ravel(), row.ravel()], dim=1)
 
 
-def _templates(
+def cut_templates(
     pictures: Pictures, own: np.ndarray, middle: np.ndarray, offsets: torch.Tensor, config: PatchConfig
-) -> _Templates:
+) -> Templates:
     """The patches of points at pixels `middle` [N, 2] of their frames `own` [N]."""
     shape = (len(own), len(offsets))
     grey, slope, weight = torch.zeros(shape), torch.zeros(*shape, 2), torch.zeros(shape)
@@ -194,7 +193,7 @@ def _templates(
                 pictures.sample(int(t), places - step)[0],
             )
             slope[rows, :, axis] = ahead - behind
-    return _Templates(grey, slope, weight)
+    return Templates(grey, slope, weight)
 
 
 def _warps(
@@ -220,21 +219,29 @@ def _warps(
     return start, torch.from_numpy(warp).float()
 
 
-def _laid(
+class Laid(NamedTuple):
+    """Patches as another frame shows them."""
+
+    pixels: np.ndarray  # [N, 2]
+    fits: np.ndarray  # [N] (bool) which were recognised
+    sigma: np.ndarray  # [N] pixels along the direction in which the patch says least about its place
+
+
+def lay(
     pictures: Pictures,
     t: int,
     start: np.ndarray,
     warp: torch.Tensor,
-    templates: _Templates,
+    templates: Templates,
     config: PatchConfig,
-) -> tuple[torch.Tensor, np.ndarray]:
-    """Lay patches on frame `t`, from pixels `start` [N, 2] on: places [N, 2] and which [N] (bool) fit there.
+) -> Laid:
+    """Lay patches on frame `t`, from pixels `start` [N, 2] on.
 
     Gauss-Newton on the shift alone, with the template's slopes (inverse compositional); both sides are
     brought to mean 0 and deviation 1, since light changes as the object turns.
     """
     places = began = pictures.places(t, start)
-    spread = torch.einsum("nij,sj->nsi", warp, _offsets(config))
+    spread = torch.einsum("nij,sj->nsi", warp, patch_offsets(config))
     on = pictures.sample(t, places[:, None] + spread)[1] > 0.5
     full = templates.weight.sum(1).clamp_min(1e-9)
     weight = templates.weight * on
@@ -259,7 +266,10 @@ def _laid(
         & ((places - began).norm(dim=1) < config.most_moved)
         & (shown > config.least_shown)
     )
-    return places, fits.numpy()
+    # What is unlike is taken for noise.
+    noise = (2.0 * (1.0 - likeness)).clamp_min(1e-6) * (weight**2).sum(1)
+    sigma = (noise / torch.linalg.eigvalsh(normal)[:, 0].clamp_min(1e-9)).sqrt()
+    return Laid(pictures.pixels(t, places), fits.numpy(), pictures.shrunk * sigma.numpy())
 
 
 def _standardised(grey: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

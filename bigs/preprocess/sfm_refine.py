@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bigs.geometry.rotations import robust_mean_rotation
 from bigs.preprocess.object_map import ObjectMap
 from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_seed import smooth_run
+from bigs.preprocess.sfm_seed import smooth_runs
 from bigs.preprocess.tracks import Tracks
 
 
@@ -59,11 +59,11 @@ def refine(
     for _ in range(config.passes):
         best = _made_anew(map_, tracks, map_.rotations, map_.transl)
         misfit = best.misfit()
-        for model, rotations, transl in splices(map_, models, start, config):
+        for part, rotations, transl in splices(map_, models, start, config):
             anew = _made_anew(map_, tracks, rotations, transl)
             # A model that turns otherwise even from where the map takes it up was wrong itself, and what
             # came of it is no better than chance.
-            agrees = disagreement(anew.rotations, model)[1].max(initial=0.0) <= config.disagreement
+            agrees = disagreement(anew.rotations, part).max() <= config.disagreement
             if agrees and anew.misfit() < misfit:
                 best, misfit = anew, anew.misfit()
         map_ = best
@@ -83,20 +83,29 @@ def polish(map_: ObjectMap, rounds: int) -> None:
         map_.triangulate()
 
 
-def disagreement(rotations: np.ndarray, model: PartialModel) -> tuple[np.ndarray, np.ndarray]:
-    """By how much a partial model's frames are turned against the poses [T, 3, 3].
+def smooth_parts(models: Iterable[PartialModel]) -> list[PartialModel]:
+    """The poses of partial models in their smooth runs: what they say beyond a kink is another matter.
 
-    Only its longest smooth run counts, and a model of few points not at all: such are often wrong themselves.
+    Short runs and models of few points are left out: such are often wrong themselves.
+    """
+    return [
+        model._replace(frames=model.frames[run], rotations=model.rotations[run], transl=model.transl[run])
+        for model in models
+        if len(model.points) >= _FEWEST_POINTS
+        for run in smooth_runs(model.frames, model.rotations)
+        if len(run) >= _FEWEST_FRAMES
+    ]
+
+
+def disagreement(rotations: np.ndarray, part: PartialModel) -> np.ndarray:
+    """By how much a partial model's F frames are turned against the poses [T, 3, 3].
 
     Returns:
-        Rows [n] of the model, and degrees [n] after the one turn of its frame that suits most of them.
+        Degrees [F] after the one turn of its frame that suits most of them.
     """
-    rows = smooth_run(model.frames, model.rotations)
-    if len(rows) < _FEWEST_FRAMES or len(model.points) < _FEWEST_POINTS:
-        return np.zeros(0, dtype=int), np.zeros(0)
-    between = model.rotations[rows].transpose(0, 2, 1) @ rotations[model.frames[rows]]
+    between = part.rotations.transpose(0, 2, 1) @ rotations[part.frames]
     usual = robust_mean_rotation(torch.from_numpy(between)).numpy()
-    return rows, np.degrees(Rotation.from_matrix(between @ usual.T).magnitude())
+    return np.degrees(Rotation.from_matrix(between @ usual.T).magnitude())
 
 
 _FEWEST_FRAMES = 5
@@ -113,7 +122,7 @@ def _made_anew(map_: ObjectMap, tracks: Tracks, rotations: np.ndarray, transl: n
 class Splice(NamedTuple):
     """Poses of all frames, with those of a partial model in place of the map's."""
 
-    model: PartialModel
+    part: PartialModel
     rotations: np.ndarray  # [T, 3, 3]
     transl: np.ndarray  # [T, 3]
 
@@ -121,20 +130,19 @@ class Splice(NamedTuple):
 def splices(
     map_: ObjectMap, models: Sequence[PartialModel], start: np.ndarray, config: RefineConfig
 ) -> Iterable[Splice]:
-    """What comes of putting each model that disagrees with the map in its place.
+    """What comes of putting each smooth part of a model that disagrees with the map in its place.
 
     Arguments as for `refine`; nothing where all models agree.
     """
-    for model in models:
-        rows, degrees = disagreement(map_.rotations, model)
-        if degrees.max(initial=0.0) <= config.disagreement or np.isin(model.frames, start).any():
+    for part in smooth_parts(models):
+        agrees = disagreement(map_.rotations, part).max() <= config.disagreement
+        if agrees or np.isin(part.frames, start).any():
             continue
         # From the frame nearest to the start outwards.
-        away = np.abs(model.frames[rows][:, None] - start).min(1)
-        order = rows[np.argsort(away, kind="stable")]
+        order = np.argsort(np.abs(part.frames[:, None] - start).min(1), kind="stable")
         for depth in config.depths:
             if depth < len(order):
-                yield Splice(model, *joined(map_, model, order[depth:]))
+                yield Splice(part, *joined(map_, part, order[depth:]))
 
 
 def joined(map_: ObjectMap, model: PartialModel, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

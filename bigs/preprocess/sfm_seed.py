@@ -37,11 +37,11 @@ def mirrored(rotations: np.ndarray) -> np.ndarray:
 
 
 def find_seed(map_: ObjectMap, model: PartialModel) -> Seed | None:
-    """The longest smooth run of `model`, adjusted, in the better mirror image; None if it has none.
+    """The longest smooth run of `model`, adjusted, in the better mirror image; None if it is too short.
 
     `map_` is used to try it and left with the seed's poses and points.
     """
-    run = smooth_run(model.frames, model.rotations)
+    run = smooth_runs(model.frames, model.rotations)[0]
     if len(run) < 3:
         return None
     middle = np.median(model.points, axis=0)
@@ -59,10 +59,10 @@ def find_seed(map_: ObjectMap, model: PartialModel) -> Seed | None:
     return seed
 
 
-def smooth_run(frames: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Which entries [n] of a model form its longest run of consecutive frames that turn without a kink."""
+def smooth_runs(frames: np.ndarray, rotations: np.ndarray) -> list[np.ndarray]:
+    """Which entries of a model form runs of consecutive frames that turn without a kink, longest first."""
     if len(frames) < 3:
-        return np.arange(len(frames))
+        return [np.arange(len(frames))]
     steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
     velocity = steps.as_rotvec(degrees=True) / np.diff(frames)[:, None]
     kink = np.linalg.norm(np.diff(velocity, axis=0), axis=1) > _KINK
@@ -71,8 +71,7 @@ def smooth_run(frames: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     cut = broken.copy()
     cut[1:] |= kink
     cut[:-1] |= kink
-    piece = np.concatenate([[0], np.cumsum(cut)])
-    return np.flatnonzero(piece == np.bincount(piece).argmax())
+    return sorted(np.split(np.arange(len(frames)), np.flatnonzero(cut) + 1), key=len, reverse=True)
 
 
 def mirror_evidence(map_: ObjectMap, frames: np.ndarray) -> float:

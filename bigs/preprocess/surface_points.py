@@ -1,4 +1,8 @@
-"""Points on the object where its silhouettes tell the surface: plain sides have no features of their own."""
+"""Points on the object where features tell nothing: plain sides, and what never shows.
+
+A plain side's surface is where its silhouettes end. A side that a hand hides in all frames, or that is turned
+away, is closed: the surface there is the points' convex hull within the silhouettes.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 import scipy.spatial
 import trimesh
 
-from bigs.geometry.coverage import ObjectViews, seen_in
+from bigs.geometry.coverage import ObjectViews, seen_in, times_seen
 from bigs.geometry.surface import DistanceGrid, extract_mesh, inlier_points, neighbour_distances
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
 from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
@@ -18,20 +22,22 @@ from bigs.types import MASK_VALUES
 
 
 @dataclass(frozen=True)
-class SilhouettePointsConfig:
+class SurfacePointsConfig:
     """Lengths in metres."""
 
-    surface: SurfaceConfig = field(default_factory=lambda: SurfaceConfig(resolution=72, frames=60))
+    surface: SurfaceConfig = field(
+        default_factory=lambda: SurfaceConfig(resolution=72, frames=60, margin=0.006)
+    )
     # A point of structure from motion that lies further than this outside the silhouettes is a stray.
     outside: float = 0.004
     # The surface gets points where there are none within this distance, ...
-    gap: float = 0.005
+    gap: float = 0.004
     # ... as far apart as this many usual distances of the others from their neighbours (if they were much
     # sparser they would pass for strays), ...
-    sparser: float = 1.6
-    # ... where a silhouette passes within this distance, ...
+    sparser: float = 1.2
+    # ... where a silhouette passes within this distance and it shows in this many frames, or where it shows
+    # in none.
     tight: float = 0.004
-    # ... and it shows in this many frames.
     least_seen: int = 2
     # It may lie this far behind the nearest surface of its pixel.
     tolerance: float = 0.004
@@ -43,9 +49,9 @@ def complete_points(
     image: Callable[[int], np.ndarray],
     masks: np.ndarray,
     K: np.ndarray,
-    config: SilhouettePointsConfig,
+    config: SurfacePointsConfig,
 ) -> ObjectSfm:
-    """The object with points where its silhouettes alone tell the surface, and without strays outside them.
+    """The object with points all around where features told nothing, and without strays outside silhouettes.
 
     Args:
         sfm: points and confidence.
@@ -74,16 +80,21 @@ def complete_points(
     views = ObjectViews(masks[usable] == MASK_VALUES["object"], K, poses[0][usable], poses[1][usable])
     spacing = config.sparser * float(np.median(neighbour_distances(core)))
     samples, normals = _samples(surface, spacing)
-    bare = scipy.spatial.cKDTree(core).query(samples)[0] > config.gap
-    bare &= hull.distance(samples) > -config.tight
-    chosen = np.flatnonzero(bare)[_spread(samples[bare], spacing)]
-    seen, colors = _seen_colors(views, (image(int(t)) for t in usable), (samples, normals), chosen, config)
-    united = np.concatenate([points[inside], samples[chosen[seen]]]) / alignment.scale
+    bare = np.flatnonzero(scipy.spatial.cKDTree(core).query(samples)[0] > config.gap)
+    times = times_seen(views, samples[bare], normals[bare], samples, config.tolerance)
+    told = (times >= config.least_seen) & (hull.distance(samples[bare]) > -config.tight)
+    bare = bare[told | (times == 0)]
+    chosen = bare[_spread(samples[bare], spacing)]
+    shades = _seen_colors(views, (image(int(t)) for t in usable), (samples, normals), chosen, config)
+    united = np.concatenate([points[inside], samples[chosen]])
+    colors = np.concatenate(
+        [sfm.colors[inside], _lent(samples[chosen], shades, points[inside], sfm.colors[inside])]
+    )
     return replace(
         sfm,
-        points=united,
-        colors=np.concatenate([sfm.colors[inside], colors]),
-        norm_mat=normalisation(united),
+        points=united / alignment.scale,
+        colors=colors.round().astype(np.uint8),
+        norm_mat=normalisation(united / alignment.scale),
     )
 
 
@@ -96,9 +107,9 @@ def _seen_colors(
     images: Iterable[np.ndarray],
     surface: tuple[np.ndarray, np.ndarray],
     chosen: np.ndarray,
-    config: SilhouettePointsConfig,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the samples `chosen` [n] of a surface show often enough, and their median colours there.
+    config: SurfacePointsConfig,
+) -> np.ndarray:
+    """Median colours [n, 3] of the samples `chosen` [n] of a surface where they show; NaN where they do not.
 
     `images` are those of the frames of `views`; `surface` is samples [N, 3] and their normals.
     """
@@ -109,9 +120,24 @@ def _seen_colors(
         row, column, _, _ = views.pixels(t, samples[chosen[shows]])
         for i, color in zip(np.flatnonzero(shows), image[row, column], strict=True):
             sightings[i].append(color)
-    seen = [i for i, colors in enumerate(sightings) if len(colors) >= config.least_seen]
-    colors = np.array([np.median(sightings[i], axis=0) for i in seen]).reshape(-1, 3)
-    return np.array(seen, dtype=int), colors.round().astype(np.uint8)
+    unknown = np.full(3, np.nan)
+    return np.array([np.median(shown, axis=0) if shown else unknown for shown in sightings]).reshape(-1, 3)
+
+
+def _lent(points: np.ndarray, colors: np.ndarray, others: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Colours [n, 3] of points [n, 3]; where they are NaN, the mean of the nearest points that have some.
+
+    `others` [N, 3] are points with colours `theirs` [N, 3].
+    """
+    shown = np.isfinite(colors).all(1)
+    known = np.concatenate([others, points[shown]]), np.concatenate([theirs, colors[shown]])
+    colors = colors.copy()
+    nearest = scipy.spatial.cKDTree(known[0]).query(points[~shown], k=_LENDERS)[1]
+    colors[~shown] = known[1][nearest].mean(1)
+    return colors
+
+
+_LENDERS = 3
 
 
 def _samples(surface: DistanceGrid, spacing: float) -> tuple[np.ndarray, np.ndarray]:
