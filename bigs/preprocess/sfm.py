@@ -13,6 +13,7 @@ from bigs.preprocess.artefacts import ObjectSfm
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
 from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_features
+from bigs.preprocess.sfm_follow import FollowConfig, follow
 from bigs.preprocess.sfm_grow import GrowConfig, grow
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
 from bigs.preprocess.sfm_models import Mapping, MappingConfig, frame_pairs, map_features
@@ -31,6 +32,7 @@ class SfmConfig:
 
     features: FeatureConfig = field(default_factory=FeatureConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    follow: FollowConfig = field(default_factory=FollowConfig)
     map: MapConfig = field(default_factory=MapConfig)
     grow: GrowConfig = field(default_factory=GrowConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -84,7 +86,8 @@ def structure_from_motion(
     """Poses of the object in all frames, and its points.
 
     Partial models come from pycolmap. The best one is checked for reversed depth and grown over the clip by
-    tracking, so that models need not be joined afterwards.
+    tracking, so that models need not be joined afterwards; where neighbours have few matches, features are
+    followed by their patches, too.
 
     Args:
         images: T arrays [H, W, 3] uint8.
@@ -121,9 +124,10 @@ def structure_from_motion(
     mapping = _map(features, K, size, known_focal, config.mapping, candidates)
     K = K.copy()
     K[0, 0], K[1, 1] = mapping.focal, mapping.focal * K[1, 1] / K[0, 0]
-    tracks = join_matches(mapping.matches, [len(frame.pixels) for frame in features])
+    followed, matches = follow(features, mapping.matches, images[clip], object_masks, config.follow)
+    tracks = join_matches(matches, [len(frame.pixels) for frame in followed])
     pictures = Pictures(images[clip], object_masks, config.patches)
-    attempt, tried = _best_attempt(features, tracks, pictures, mapping, K, config)
+    attempt, tried = _best_attempt(followed, tracks, pictures, mapping, K, config)
     report = _report(attempt, tried, mapping, features, (first, len(masks) - last))
     return _result(attempt.map, report, images[clip], first, config), report
 

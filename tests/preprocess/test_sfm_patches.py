@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from filmed_egg import WIDTH, picture
 from scipy.spatial.transform import Rotation
-from turning_object import AXES, K, TurningObject, rotation_errors, turning_object
+from turning_object import K, TurningObject, rotation_errors, turning_object
 
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_patches import PatchConfig, Pictures, sharpen
-
-HEIGHT, WIDTH = 360, 480
 
 
 class Filmed(NamedTuple):
@@ -25,30 +24,12 @@ class Filmed(NamedTuple):
     map: ObjectMap
 
 
-def _picture(rotation: np.ndarray, transl: np.ndarray, light: float) -> tuple[np.ndarray, np.ndarray]:
-    """The egg with a texture of waves in space, [H, W, 3] uint8, and where it is [H, W]."""
-    row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones_like(row)], axis=-1)
-    eye, ray = -(rotation.T @ transl) / AXES, (rays @ rotation) / AXES
-    a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1.0
-    root = b**2 - a * c
-    on = root > 0
-    depth = (-b - np.sqrt(root.clip(0.0))) / a
-    place = (eye + depth[..., None] * ray) * AXES
-    rng = np.random.default_rng(4)
-    waves = rng.standard_normal((40, 3))
-    waves *= (2.0 * np.pi / rng.uniform(0.007, 0.03, 40) / np.linalg.norm(waves, axis=1))[:, None]
-    texture = np.sin(place @ waves.T + rng.uniform(0.0, 6.0, 40)).sum(-1) / np.sqrt(40.0)
-    grey = np.where(on, light * (120.0 + 50.0 * texture), 30.0)
-    return np.repeat(grey.round().clip(0, 255).astype(np.uint8)[..., None], 3, axis=2), on
-
-
 @pytest.fixture(scope="module")
 def filmed() -> Filmed:
     """24 frames; no track is longer than four, so that the map is a chain of short links."""
     egg = turning_object(frames=24, points=500, noise=0.3)
     pictures = [
-        _picture(rotation, transl, 1.0 - 0.01 * t)
+        picture(rotation, transl, 1.0 - 0.01 * t)
         for t, (rotation, transl) in enumerate(zip(egg.rotations, egg.transl, strict=True))
     ]
     whole = egg.tracks()

@@ -1,0 +1,26 @@
+"""Pictures of a turning egg with a texture of waves, each ray met exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+from turning_object import AXES, K
+
+HEIGHT, WIDTH = 360, 480
+
+
+def picture(rotation: np.ndarray, transl: np.ndarray, light: float) -> tuple[np.ndarray, np.ndarray]:
+    """The egg with a texture of waves in space, [H, W, 3] uint8, and where it is [H, W]."""
+    row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones_like(row)], axis=-1)
+    eye, ray = -(rotation.T @ transl) / AXES, (rays @ rotation) / AXES
+    a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1.0
+    root = b**2 - a * c
+    on = root > 0
+    depth = (-b - np.sqrt(root.clip(0.0))) / a
+    place = (eye + depth[..., None] * ray) * AXES
+    rng = np.random.default_rng(4)
+    waves = rng.standard_normal((40, 3))
+    waves *= (2.0 * np.pi / rng.uniform(0.007, 0.03, 40) / np.linalg.norm(waves, axis=1))[:, None]
+    texture = np.sin(place @ waves.T + rng.uniform(0.0, 6.0, 40)).sum(-1) / np.sqrt(40.0)
+    grey = np.where(on, light * (120.0 + 50.0 * texture), 30.0)
+    return np.repeat(grey.round().clip(0, 255).astype(np.uint8)[..., None], 3, axis=2), on
