@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -42,6 +42,9 @@ class SfmConfig:
     seeds: int = 3
     # The largest model is the surest start: another's outcome must have less than this share of its misfit.
     clearly_better: float = 0.97
+    # If the largest model has less than this share of the frames and nothing sure comes of any, what was
+    # followed is mapped, too.
+    large_share: float = 0.33
 
 
 class SfmReport(NamedTuple):
@@ -121,14 +124,27 @@ def structure_from_motion(
     else:
         features = extract_learned(images[clip], object_masks, matcher, config.features)
         candidates = match_learned(features, frame_pairs(len(features), config.mapping), size, matcher)
-    mapping = _map(features, K, size, known_focal, config.mapping, candidates)
-    K = K.copy()
-    K[0, 0], K[1, 1] = mapping.focal, mapping.focal * K[1, 1] / K[0, 0]
+    mapping = map_features(features, K, size, known_focal, config.mapping, candidates)
+    if not mapping.models:
+        # Loosened thresholds will do, since whatever comes of a model is checked.
+        mapping = map_features(features, K, size, known_focal, config.mapping.loosened(), candidates)
     followed, matches = follow(features, mapping.matches, images[clip], object_masks, config.follow)
     tracks = join_matches(matches, [len(frame.pixels) for frame in followed])
+
+    def mappings() -> Iterator[Mapping]:
+        yield mapping
+        if max((len(model.frames) for model in mapping.models), default=0) < config.large_share * len(
+            features
+        ):
+            known = known_focal or bool(mapping.models)
+            guess = _with_focal(K, mapping.focal)
+            yield map_features(followed, guess, size, known, config.mapping.loosened(), matches)
+
     pictures = Pictures(images[clip], object_masks, config.patches)
-    attempt, tried = _best_attempt(followed, tracks, pictures, mapping, K, config)
-    report = _report(attempt, tried, mapping, features, (first, len(masks) - last))
+    attempt, tried = _best_attempt(followed, tracks, pictures, mappings(), K, config)
+    if attempt is None:
+        raise InputError(_nothing_found(mapping, features))
+    report = _report(attempt, tried, features, (first, len(masks) - last))
     return _result(attempt.map, report, images[clip], first, config), report
 
 
@@ -139,70 +155,66 @@ _FEWEST_FRAMES = 5
 class _Attempt(NamedTuple):
     map: ObjectMap
     seed: Seed
-    model: int
+    mapping: Mapping
+    model: int  # which of its models was the start
     checks: SfmChecks
     misfit: float  # before points were sought that were never matched
 
 
-def _map(
-    features: Sequence[FrameFeatures],
-    K: np.ndarray,
-    size: tuple[int, int],
-    known_focal: bool,
-    config: MappingConfig,
-    candidates: dict[tuple[int, int], np.ndarray] | None,
-) -> Mapping:
-    """Partial models; with loosened thresholds when the usual ones give none, since the best is checked."""
-    mapping = map_features(features, K, size, known_focal, config, candidates)
-    if not mapping.models:
-        mapping = map_features(features, K, size, known_focal, config.loosened(), candidates)
-    if not mapping.models:
-        counts = [len(frame.pixels) for frame in features]
-        matches = _neighbour_matches(mapping, len(features))[:-1]
-        raise InputError(
-            f"object poses: expected about 100 features a frame and 30 matches between neighbours, found "
-            f"{np.median(counts):.0f} and {np.median(matches):.0f} (medians of {len(counts)} frames): the "
-            "object has too little texture or hardly turns; supply its poses as processed/object_sfm.npz, "
-            "or film it closer, in better light, or with a pattern on it"
-        )
-    return mapping
+def _with_focal(K: np.ndarray, focal: float) -> np.ndarray:
+    """`K` with another focal length, in pixels along x; pixels keep their shape."""
+    K = K.copy()
+    K[0, 0], K[1, 1] = focal, focal * K[1, 1] / K[0, 0]
+    return K
 
 
 def _best_attempt(
     features: Sequence[FrameFeatures],
     tracks: Tracks,
     pictures: Pictures,
-    mapping: Mapping,
+    mappings: Iterable[Mapping],
     K: np.ndarray,
     config: SfmConfig,
-) -> tuple[_Attempt, int]:
-    """Start from one model after another until nothing serious is found; the best fit counts."""
+) -> tuple[_Attempt | None, int]:
+    """Start from one model after another until nothing serious is found; the best fit counts, if any."""
     best: _Attempt | None = None
     tried = 0
-    for number, model in enumerate(mapping.models[: config.seeds]):
-        map_ = ObjectMap(features, tracks, K, config.map)
-        seed = find_seed(map_, model)
-        if seed is None or not map_.use().any():
-            continue
-        tried += 1
-        grow(map_, mapping.models, config.grow)
-        map_, misfit = refine(map_, tracks, mapping.models, seed.frames, config.refine)
-        if not map_.use().any():
-            continue
-        sharpen(map_, pictures, config.patches)
-        checks = check_map(map_, features, tracks, mapping.models, config.checks)
-        attempt = _Attempt(map_, seed, number, checks, misfit)
-        if best is None or attempt.misfit < config.clearly_better * best.misfit:
-            best = attempt
-        if not best.checks.doubtful().any():
-            break
-    if best is None:
+    for mapping in mappings:
+        for number, model in enumerate(mapping.models[: config.seeds]):
+            map_ = ObjectMap(features, tracks, _with_focal(K, mapping.focal), config.map)
+            seed = find_seed(map_, model)
+            if seed is None or not map_.use().any():
+                continue
+            tried += 1
+            grow(map_, mapping.models, config.grow)
+            map_, misfit = refine(map_, tracks, mapping.models, seed.frames, config.refine)
+            if not map_.use().any():
+                continue
+            sharpen(map_, pictures, config.patches)
+            checks = check_map(map_, features, tracks, mapping.models, config.checks)
+            attempt = _Attempt(map_, seed, mapping, number, checks, misfit)
+            if best is None or attempt.misfit < config.clearly_better * best.misfit:
+                best = attempt
+            if not best.checks.doubtful().any():
+                return best, tried
+    return best, tried
+
+
+def _nothing_found(mapping: Mapping, features: Sequence[FrameFeatures]) -> str:
+    if mapping.models:
         sizes = ", ".join(str(len(model.frames)) for model in mapping.models)
-        raise InputError(
+        return (
             f"object poses: expected a model that moves smoothly, found {len(mapping.models)} (of {sizes} "
             "frames) that all jump; film the object turning more slowly, or supply processed/object_sfm.npz"
         )
-    return best, tried
+    counts = [len(frame.pixels) for frame in features]
+    matches = _neighbour_matches(mapping, len(features))[:-1]
+    return (
+        f"object poses: expected about 100 features a frame and 30 matches between neighbours, found "
+        f"{np.median(counts):.0f} and {np.median(matches):.0f} (medians of {len(counts)} frames): the "
+        "object has too little texture or hardly turns; supply its poses as processed/object_sfm.npz, "
+        "or film it closer, in better light, or with a pattern on it"
+    )
 
 
 def _neighbour_matches(mapping: Mapping, frames: int) -> np.ndarray:
@@ -212,12 +224,12 @@ def _neighbour_matches(mapping: Mapping, frames: int) -> np.ndarray:
 def _report(
     attempt: _Attempt,
     tried: int,
-    mapping: Mapping,
     features: Sequence[FrameFeatures],
     outside: tuple[int, int],
 ) -> SfmReport:
     """The report over the whole clip; `outside` counts the frames without object at its ends."""
     before, after = outside
+    mapping = attempt.mapping
     order = [attempt.model, *(i for i in range(len(mapping.models)) if i != attempt.model)]
     models = [[int(t) + before for t in mapping.models[i].frames] for i in order]
     frames = len(features)

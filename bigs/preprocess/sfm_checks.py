@@ -17,8 +17,8 @@ from bigs.preprocess.bundle import turn_uncertainties
 from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_features import FrameFeatures
 from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_refine import disagreement, smooth_parts
-from bigs.preprocess.sfm_seed import mirror_evidence, mirrored
+from bigs.preprocess.sfm_refine import disagreement, joined, smooth_parts
+from bigs.preprocess.sfm_seed import evidence, mirror_evidence, mirrored
 from bigs.preprocess.tracks import Tracks
 
 
@@ -85,7 +85,8 @@ def check_map(
     # Of two parts that hang together loosely the larger one is believed.
     tied = (between <= config.most_uncertain).sum(1)
     uncertainty = between[max(range(frames), key=lambda t: (tied[t], sightings[t]))]
-    mirror = _mirror_evidence(map_, features, tracks, config.mirror_window)
+    trial = ObjectMap(features, tracks, map_.K, MapConfig())
+    mirror = _mirror_evidence(map_, trial, config.mirror_window)
     cosine = turn_cosines(map_.rotations)
     steps = _step_angles(map_.rotations)
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -98,7 +99,9 @@ def check_map(
         # A model that is the map's mirror image in depth is one more start that came out reversed: which of
         # the two is right, perspective tells.
         image = part._replace(rotations=mirrored(part.rotations))
-        if disagreement(map_.rotations, image).max() > config.most_disagreement:
+        if min(degrees.max(), disagreement(map_.rotations, image).max()) <= config.most_disagreement:
+            continue
+        if not _outdone(map_, trial, part, config):
             otherwise[part.frames[degrees > config.most_disagreement]] = True
     signs = {
         FEW: sightings < config.least_sightings,
@@ -132,17 +135,29 @@ def _step_angles(rotations: np.ndarray) -> np.ndarray:
     return np.degrees(steps.magnitude())
 
 
-def _mirror_evidence(
-    map_: ObjectMap, features: Sequence[FrameFeatures], tracks: Tracks, window: int
-) -> np.ndarray:
-    """For each frame, the least over windows of the evidence against the mirror image."""
+def _outdone(map_: ObjectMap, trial: ObjectMap, part: PartialModel, config: CheckConfig) -> bool:
+    """Whether the sightings in a part's frames, taken alone, say what the map says rather than the part."""
+    rows = np.arange(len(part.frames))
+    poses = map_.rotations[part.frames], map_.transl[part.frames]
+    rotations, transl = joined(map_, part, rows)
+    better, ours, theirs = evidence(trial, part.frames, poses, (rotations[part.frames], transl[part.frames]))
+    off = [disagreement(map_.rotations, part._replace(rotations=turned)).max() for turned in (ours, theirs)]
+    # If the part, too, comes to what the map says, there is nothing to choose.
+    one = off[1] <= config.most_disagreement
+    return off[0] <= config.most_disagreement and (one or better >= config.least_evidence)
+
+
+def _mirror_evidence(map_: ObjectMap, trial: ObjectMap, window: int) -> np.ndarray:
+    """For each frame, the least over windows of the evidence against the mirror image.
+
+    `trial` is a map of the same tracks to try it on.
+    """
     frames = len(map_.posed)
-    evidence = np.full(frames, np.inf)
-    trial = ObjectMap(features, tracks, map_.K, MapConfig())
+    least = np.full(frames, np.inf)
     for start in range(0, max(frames - window // 2, 1), max(window // 2, 1)):
         inside = np.arange(start, min(start + window, frames))
         if len(inside) < 3:
             continue
         trial.rotations[:], trial.transl[:] = map_.rotations, map_.transl
-        evidence[inside] = np.minimum(evidence[inside], mirror_evidence(trial, inside))
-    return evidence
+        least[inside] = np.minimum(least[inside], mirror_evidence(trial, inside))
+    return least

@@ -62,7 +62,11 @@ def follow(
         config: see there.
     """
     patch = PatchConfig(
-        half=config.half, iterations=config.iterations, likeness=config.likeness, most_moved=np.inf
+        half=config.half,
+        iterations=config.iterations,
+        likeness=config.likeness,
+        most_moved=np.inf,
+        most_unsure=config.most_unsure,
     )
     levels = [Pictures(images, masks, patch, coarser) for coarser in config.levels]
     features, united = list(features), dict(matches)
@@ -79,7 +83,7 @@ def follow(
         guess = start + _guided(start, here.pixels[known[:, 0]], there.pixels[known[:, 1]], config)
         laid = _followed(levels, (t, t + 1), start, guess, patch)
         back = _followed(levels, (t + 1, t), laid.pixels, laid.pixels + start - guess, patch)
-        fits = laid.fits & (laid.sigma < config.most_unsure) & _on(masks[t + 1], laid.pixels)
+        fits = laid.fits & _on(masks[t + 1], laid.pixels)
         fits &= back.fits & (np.linalg.norm(back.pixels - start, axis=1) < config.there_and_back)
         pairs, features[t + 1] = _landed(there, known[:, 1], here, chosen[fits], laid.pixels[fits], config)
         united[t, t + 1] = np.concatenate([known, pairs])

@@ -41,6 +41,10 @@ class PatchConfig:
     # ... least correlation with what it is laid on, and how far it may be from where the map expects it.
     likeness: float = 0.8
     most_moved: float = 4.0
+    # Standard deviation of its place along the direction in which it says least.
+    most_unsure: float = 0.2
+    # Matches whose patch was not recognised count in frames with fewer recognised ones than this.
+    enough: int = 30
     iterations: int = 10
     # How often all is measured and adjusted.
     passes: int = 3
@@ -70,9 +74,11 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         found = _measured(map_, matched, pictures, config)
         if found is None:
             return
-        # A match counts where its patch was not recognised: far beyond the plane it stands for, say.
+        # Matches whose patch was not recognised stand for other places more often than not, but a frame may
+        # have nothing else.
         total = len(map_.points)
         missed = ~np.isin(matched.frame * total + matched.track, found.frame * total + found.track)
+        missed &= (np.bincount(found.frame, minlength=len(frames)) < config.enough)[matched.frame]
         map_.replace_sightings(
             *(np.concatenate([new, old[missed]]) for new, old in zip(found, matched, strict=True))
         )
@@ -160,10 +166,11 @@ def _measured(
         rows = np.flatnonzero(whole & (cosine > config.least_cosine) & (own != t))
         start, warp = _warps(map_, t, own[rows], points[rows], normals[rows])
         laid = lay(pictures, t, start, warp, Templates(*(part[rows] for part in templates)), config)
-        here = np.flatnonzero(whole & (own == t))
-        at = np.concatenate([laid.pixels[laid.fits], middle[here]])
-        rows = np.concatenate([rows[laid.fits], here])
-        found.append(Sightings(np.full(len(rows), t), tracks[rows], at))
+        rows = rows[laid.fits]
+        found.append(Sightings(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits]))
+    # Its own sighting counts for a patch that was recognised elsewhere.
+    again = np.isin(tracks, np.concatenate([sightings.track for sightings in found]))
+    found.append(Sightings(own[again], tracks[again], middle[again]))
     return Sightings(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
@@ -223,8 +230,7 @@ class Laid(NamedTuple):
     """Patches as another frame shows them."""
 
     pixels: np.ndarray  # [N, 2]
-    fits: np.ndarray  # [N] (bool) which were recognised
-    sigma: np.ndarray  # [N] pixels along the direction in which the patch says least about its place
+    fits: np.ndarray  # [N] (bool) which were recognised, and say where they are
 
 
 def lay(
@@ -269,7 +275,8 @@ def lay(
     # What is unlike is taken for noise.
     noise = (2.0 * (1.0 - likeness)).clamp_min(1e-6) * (weight**2).sum(1)
     sigma = (noise / torch.linalg.eigvalsh(normal)[:, 0].clamp_min(1e-9)).sqrt()
-    return Laid(pictures.pixels(t, places), fits.numpy(), pictures.shrunk * sigma.numpy())
+    fits &= pictures.shrunk * sigma < config.most_unsure
+    return Laid(pictures.pixels(t, places), fits.numpy())
 
 
 def _standardised(grey: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -77,16 +77,33 @@ def smooth_runs(frames: np.ndarray, rotations: np.ndarray) -> list[np.ndarray]:
 def mirror_evidence(map_: ObjectMap, frames: np.ndarray) -> float:
     """By how many standard deviations consecutive `frames` fit better than their mirror image in depth.
 
-    Both are adjusted by themselves, and the tracks' losses compared one by one: what fits neither image, as
-    many sightings do on plain objects, says nothing, and many tracks that say a little say it surely. 0 if
-    no track fits either. `map_` is changed; give a copy.
+    `map_` is changed; give a copy.
     """
     rotations, transl = map_.rotations[frames].copy(), map_.transl[frames].copy()
-    losses = []
-    for turned in (rotations, mirrored(rotations)):
-        map_.restart(frames, turned, transl)
+    return evidence(map_, frames, (rotations, transl), (mirrored(rotations), transl))[0]
+
+
+def evidence(
+    map_: ObjectMap,
+    frames: np.ndarray,
+    poses: tuple[np.ndarray, np.ndarray],
+    others: tuple[np.ndarray, np.ndarray],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """By how many standard deviations consecutive `frames` fit better at `poses` than at `others`.
+
+    Both are adjusted by themselves, and the tracks' losses compared one by one: what fits neither, as many
+    sightings do on plain objects, says nothing, and many tracks that say a little say it surely. 0 if no
+    track fits either. `map_` is changed; give a copy.
+
+    Returns:
+        The evidence, and the rotations [F, 3, 3] that both came to.
+    """
+    losses, came_to = [], []
+    for rotations, transl in (poses, others):
+        map_.restart(frames, rotations, transl)
         map_.settle()
         losses.append(map_.losses())
+        came_to.append(map_.rotations[frames].copy())
     better = losses[1] - losses[0]
     spread = float(np.linalg.norm(better))
-    return float(better.sum()) / spread if spread > 0 else 0.0
+    return float(better.sum()) / spread if spread > 0 else 0.0, came_to[0], came_to[1]

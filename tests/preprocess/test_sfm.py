@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from turning_object import rotation_errors
+from filmed_egg import picture
+from turning_object import K, rotation_errors, turning_object
 
 from bigs.checks import InputError
 from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import load_hand_models
 from bigs.preprocess.sfm import SfmConfig, structure_from_motion
+from bigs.preprocess.sfm_features import FrameFeatures
+from bigs.preprocess.sfm_follow import FollowConfig, Matches
+from bigs.preprocess.sfm_models import Mapping, MappingConfig, map_features
 from bigs.preprocess.sfm_points import normalisation, trim_points
 
 FRAMES = 20
@@ -55,6 +60,38 @@ def test_a_generated_clip_gets_its_poses(generated: Path) -> None:
     canon = found.points @ found.norm_mat[:3, :3].T + found.norm_mat[:3, 3]
     assert np.linalg.norm(canon, axis=1).max() == pytest.approx(1.0)
     assert found.colors.shape == found.points.shape and found.colors.dtype == np.uint8
+
+
+def test_what_was_followed_is_mapped_where_features_alone_give_no_model(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    egg = turning_object(frames=16, points=50)
+    shown = [
+        picture(rotation, transl, 1.0) for rotation, transl in zip(egg.rotations, egg.transl, strict=True)
+    ]
+    masks = np.stack([np.where(on, 50, 0).astype(np.uint8) for _, on in shown])
+    told = []
+
+    def without_models(
+        features: Sequence[FrameFeatures],
+        K: np.ndarray,
+        size: tuple[int, int],
+        known_focal: bool,
+        config: MappingConfig,
+        candidates: Matches | None = None,
+    ) -> Mapping:
+        mapping = map_features(features, K, size, known_focal, config, candidates)
+        told.append((config, mapping))
+        return mapping._replace(models=[]) if candidates is None else mapping
+
+    monkeypatch.setattr("bigs.preprocess.sfm.map_features", without_models)
+    config = SfmConfig(follow=FollowConfig(enough=10**6))
+    found, _ = structure_from_motion([image for image, _ in shown], masks, K, config)
+    usual, loosened = config.mapping, config.mapping.loosened()
+    assert [config for config, _ in told] == [usual, loosened, loosened]
+    matches = [sum(len(pairs) for pairs in mapping.matches.values()) for _, mapping in told]
+    assert matches[2] > 1.05 * matches[1]
+    assert rotation_errors(found.rotations, egg.rotations).max() < 1.5
 
 
 def test_an_object_without_texture_is_refused_with_what_was_found(

@@ -126,3 +126,11 @@ def test_a_cloud_too_small_for_a_surface_stays_as_it_is(
 ) -> None:
     few = replace(partly_seen, points=partly_seen.points[:20], colors=partly_seen.colors[:20])
     assert complete_points(few, motion, image, masks, K, CONFIG) is few
+
+
+def test_a_cloud_without_gaps_gets_no_points(
+    partly_seen: ObjectSfm, motion: Alignment, masks: np.ndarray
+) -> None:
+    found = complete_points(partly_seen, motion, image, masks, K, replace(CONFIG, gap=0.2))
+    assert np.array_equal(found.points, partly_seen.points[:-2])
+    assert np.array_equal(found.colors, partly_seen.colors[:-2])
