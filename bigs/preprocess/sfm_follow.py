@@ -104,7 +104,7 @@ def _chosen(
     blocked = taken.copy()
     for i in matched:
         blocked[near[i]] = True
-    chosen = []
+    chosen: list[int] = []
     for i in order:
         if not blocked[i] and len(chosen) < config.most:
             chosen.append(i)

@@ -67,24 +67,33 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         config: see there.
     """
     use = map_.use()
-    matched = Sightings(map_.frame[use], map_.track[use], map_.pixels[use])
+    found = matched = Sightings(map_.frame[use], map_.track[use], map_.pixels[use])
     frames = np.arange(len(map_.posed))
     everything = np.ones(len(frames), dtype=bool)
     for _ in range(config.passes):
-        found = _measured(map_, matched, pictures, config)
-        if found is None:
+        measured = _measured(map_, matched, pictures, config)
+        if measured is None:
             return
+        found = measured
         # Matches whose patch was not recognised stand for other places more often than not, but a frame may
         # have nothing else.
-        total = len(map_.points)
-        missed = ~np.isin(matched.frame * total + matched.track, found.frame * total + found.track)
-        missed &= (np.bincount(found.frame, minlength=len(frames)) < config.enough)[matched.frame]
-        map_.replace_sightings(
-            *(np.concatenate([new, old[missed]]) for new, old in zip(found, matched, strict=True))
-        )
+        poor = np.bincount(found.frame, minlength=len(frames)) < config.enough
+        map_.replace_sightings(*_united(found, matched, poor))
         map_.judge()
         map_.adjust(frames, everything, map_.config.bundle)
         map_.judge()
+    # Where they agree with these poses they have a place all the same, and tie frames to each other.
+    map_.replace_sightings(*_united(found, matched, everything))
+    map_.judge()
+    map_.triangulate()
+
+
+def _united(found: Sightings, matched: Sightings, frames: np.ndarray) -> Sightings:
+    """The sightings `found`, and those of `matched` in `frames` [T] (bool) whose patches were not."""
+    total = 1 + max(sightings.track.max(initial=0) for sightings in (found, matched))
+    missed = ~np.isin(matched.frame * total + matched.track, found.frame * total + found.track)
+    missed &= frames[matched.frame]
+    return Sightings(*(np.concatenate([new, old[missed]]) for new, old in zip(found, matched, strict=True)))
 
 
 class Pictures:
