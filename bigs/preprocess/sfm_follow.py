@@ -96,12 +96,11 @@ def _chosen(
 ) -> np.ndarray:
     """Which features to follow: `reached` ones first, none that is `matched` already or near another."""
     order = np.concatenate([reached, np.setdiff1d(np.arange(len(here.pixels)), reached)])
-    taken = np.zeros(len(here.pixels), dtype=bool)
-    taken[matched] = True
-    near = (
-        scipy.spatial.cKDTree(here.pixels).query_ball_point(here.pixels, config.apart) if len(order) else []
-    )
-    blocked = taken.copy()
+    if len(order) == 0:
+        return order
+    # Each feature is near itself, too.
+    near = scipy.spatial.cKDTree(here.pixels).query_ball_point(here.pixels, config.apart)
+    blocked = np.zeros(len(here.pixels), dtype=bool)
     for i in matched:
         blocked[near[i]] = True
     chosen: list[int] = []

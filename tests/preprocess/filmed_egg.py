@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from turning_object import AXES, K
+from turning_object import AXES, K, TurningObject
 
 HEIGHT, WIDTH = 360, 480
+
+
+def film(egg: TurningObject) -> tuple[list[np.ndarray], np.ndarray]:
+    """Pictures of all frames, in light that fades by a hundredth a frame, and where the egg is [T, H, W]."""
+    shown = [
+        picture(rotation, transl, 1.0 - 0.01 * t)
+        for t, (rotation, transl) in enumerate(zip(egg.rotations, egg.transl, strict=True))
+    ]
+    return [image for image, _ in shown], np.stack([on for _, on in shown])
 
 
 def picture(rotation: np.ndarray, transl: np.ndarray, light: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filmed_egg import picture
+from filmed_egg import film
 from turning_object import K, rotation_errors, turning_object
 
 from bigs.checks import InputError
@@ -66,10 +66,8 @@ def test_what_was_followed_is_mapped_where_features_alone_give_no_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     egg = turning_object(frames=16, points=50)
-    shown = [
-        picture(rotation, transl, 1.0) for rotation, transl in zip(egg.rotations, egg.transl, strict=True)
-    ]
-    masks = np.stack([np.where(on, 50, 0).astype(np.uint8) for _, on in shown])
+    images, on = film(egg)
+    masks = np.where(on, 50, 0).astype(np.uint8)
     told = []
 
     def without_models(
@@ -86,7 +84,7 @@ def test_what_was_followed_is_mapped_where_features_alone_give_no_model(
 
     monkeypatch.setattr("bigs.preprocess.sfm.map_features", without_models)
     config = SfmConfig(follow=FollowConfig(enough=10**6))
-    found, _ = structure_from_motion([image for image, _ in shown], masks, K, config)
+    found, _ = structure_from_motion(images, masks, K, config)
     usual, loosened = config.mapping, config.mapping.loosened()
     assert [config for config, _ in told] == [usual, loosened, loosened]
     matches = [sum(len(pairs) for pairs in mapping.matches.values()) for _, mapping in told]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from filmed_egg import WIDTH, picture
+from filmed_egg import WIDTH, film
 from turning_object import AXES, K, TurningObject, turning_object
 
 from bigs.preprocess.sfm_follow import FollowConfig, Matches, follow
@@ -28,12 +28,8 @@ class Filmed(NamedTuple):
 @pytest.fixture(scope="module")
 def filmed() -> Filmed:
     egg = turning_object(frames=FRAMES, points=400, noise=0.1)
-    pictures = [
-        picture(rotation, transl, 1.0 - 0.01 * t)
-        for t, (rotation, transl) in enumerate(zip(egg.rotations, egg.transl, strict=True))
-    ]
     few = {pair: rows[:25] for pair, rows in egg.matches(overlap=2).items()}
-    return Filmed(egg, [image for image, _ in pictures], np.stack([on for _, on in pictures]), few)
+    return Filmed(egg, *film(egg), few)
 
 
 def carried(egg: TurningObject, t: int, pixels: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from filmed_egg import WIDTH, picture
+from filmed_egg import WIDTH, film
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
@@ -28,10 +28,6 @@ class Filmed(NamedTuple):
 def filmed() -> Filmed:
     """24 frames; no track is longer than four, so that the map is a chain of short links."""
     egg = turning_object(frames=24, points=500, noise=0.3)
-    pictures = [
-        picture(rotation, transl, 1.0 - 0.01 * t)
-        for t, (rotation, transl) in enumerate(zip(egg.rotations, egg.transl, strict=True))
-    ]
     whole = egg.tracks()
     _, piece = np.unique(whole.track * 24 + (whole.frame + whole.track) // 4, return_inverse=True)
     tracks = whole._replace(track=piece, total=int(piece.max()) + 1)
@@ -40,7 +36,7 @@ def filmed() -> Filmed:
     bend = Rotation.from_rotvec(np.linspace(-1.5, 1.5, 24)[:, None] * [0.0, 1.0, 0.4], degrees=True)
     map_.restart(np.arange(24), egg.rotations @ bend.as_matrix(), egg.transl)
     map_.settle()
-    return Filmed(egg, [image for image, _ in pictures], np.stack([on for _, on in pictures]), map_)
+    return Filmed(egg, *film(egg), map_)
 
 
 def test_poses_and_points_get_better(filmed: Filmed) -> None:
