@@ -11,8 +11,9 @@ import torch
 from bigs.commands.rendering import render_frame, render_input_view
 from bigs.data.base import Clip
 from bigs.data.novel import load_novel_views
-from bigs.metrics.picture import NOVEL, NOVEL_SCALED, Distance, picture_scores
+from bigs.metrics.picture import ALIGNED, NOVEL, NOVEL_SCALED, Distance, aligned_psnr, picture_scores
 from bigs.models.playback import Playback
+from bigs.types import MASK_VALUES
 
 
 def frame_scores(clip: Clip, playback: Playback, distance: Distance | None = None) -> dict[str, np.ndarray]:
@@ -48,8 +49,15 @@ def novel_scores(
             viewmat, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (view.viewmat, view.K))
             # A clip that grows and a camera that stays see what a clip that stays and a nearer camera see.
             viewmat[:3, 3] /= size
-            color, _ = render_frame(playback, view.frame_index, viewmat, K, *view.size)
-            rows.append(picture_scores(color, view.image() / 255.0, view.mask() != 0, distance))
+            camera = (view.frame_index, viewmat, K, *view.size)
+            image, labels = view.image() / 255.0, view.mask()
+            color, _ = render_frame(playback, *camera)
+            alone = {entity: render_frame(playback, *camera, [entity])[0] for entity in playback.entities}
+            masks = {entity: labels == value for entity, value in MASK_VALUES.items()}
+            # A subject that was not reconstructed shows nothing.
+            renders = {entity: alone.get(entity, np.zeros_like(color)) for entity in masks}
+            scores_here = picture_scores(color, image, labels != 0, distance)
+            rows.append(scores_here | {ALIGNED: aligned_psnr(renders, image, masks)})
         columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
         scores |= {f"{prefix}{key}": value for key, value in means(columns).items()}
     return scores

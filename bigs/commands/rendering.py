@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +14,26 @@ from bigs.commands.run_folder import load_run
 from bigs.data.transforms import load_transforms
 from bigs.models.playback import Playback
 from bigs.raster import rasterization
+from bigs.types import Entity
 from bigs.viewer.preview import save_picture
 
 
 @torch.no_grad()
 def render_frame(
-    playback: Playback, frame: int, viewmat: Tensor, K: Tensor, width: int, height: int
+    playback: Playback,
+    frame: int,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    entities: Iterable[Entity] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """One time of the clip from one camera: colour over black [H, W, 3] and alpha [H, W], float in [0, 1].
 
-    `viewmat` [4, 4] leads from the clip's camera frame of that time to the rendering camera (OpenCV axes).
+    `viewmat` [4, 4] leads from the clip's camera frame of that time to the rendering camera (OpenCV axes);
+    `entities` are those shown, all if not given.
     """
-    out = rasterization(*playback.gaussians([frame]), viewmat[None], K[None], width, height)
+    out = rasterization(*playback.gaussians([frame], entities), viewmat[None], K[None], width, height)
     return out.colors[0, 0].numpy(), out.alphas[0, 0, ..., 0].numpy()
 
 

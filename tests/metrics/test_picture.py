@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from bigs.metrics.picture import PICTURE_METRICS, picture_scores
+from bigs.metrics.picture import PICTURE_METRICS, aligned_psnr, picture_scores
 
 
 @pytest.fixture
@@ -72,3 +72,21 @@ def test_an_empty_mask_has_no_score(pictures: tuple[np.ndarray, np.ndarray, np.n
     found = picture_scores(render, image, np.zeros_like(mask), lambda a, b: 0.0)
     assert np.isnan(list(found.values())).all()
     assert set(found) == {key for key in PICTURE_METRICS if not key.startswith("novel_")}
+
+
+def test_each_subject_is_compared_where_it_fits_best() -> None:
+    rng = np.random.default_rng(5)
+    image = rng.random((48, 64, 3))
+    masks = {"cup": np.zeros((48, 64), dtype=bool), "hand": np.zeros((48, 64), dtype=bool)}
+    masks["cup"][12:24, 10:30], masks["hand"][30:36, 30:50] = True, True
+    shifts = {"cup": (-3, 7), "hand": (5, -6)}
+    noise = 0.1 * rng.standard_normal(image.shape)
+    renders = {name: np.roll(image + noise, shift, axis=(0, 1)) for name, shift in shifts.items()}
+    errors = {name: np.mean(noise[mask] ** 2) for name, mask in masks.items()}
+    areas = {name: mask.sum() for name, mask in masks.items()}
+    expected = -10 * sum(areas[n] * np.log10(errors[n]) for n in masks) / sum(areas.values())
+    assert aligned_psnr(renders, image, masks) == pytest.approx(expected)
+    # One pixel beyond the reach, and what is found is no better than any other shift of noise.
+    assert aligned_psnr(renders, image, masks, reach=7) < expected - 3.0
+    assert aligned_psnr(dict.fromkeys(masks, image), image, masks) == np.inf
+    assert np.isnan(aligned_psnr(renders, image, dict.fromkeys(masks, np.zeros((48, 64), dtype=bool))))
