@@ -53,9 +53,11 @@ def novel_scores(
             image, labels = view.image() / 255.0, view.mask()
             color, _ = render_frame(playback, *camera)
             alone = {entity: render_frame(playback, *camera, [entity])[0] for entity in playback.entities}
-            masks = {entity: labels == value for entity, value in MASK_VALUES.items()}
+            masks: dict[str, np.ndarray] = {entity: labels == value for entity, value in MASK_VALUES.items()}
             # A subject that was not reconstructed shows nothing.
-            renders = {entity: alone.get(entity, np.zeros_like(color)) for entity in masks}
+            renders: dict[str, np.ndarray] = {
+                entity: alone.get(entity, np.zeros_like(color)) for entity in MASK_VALUES
+            }
             scores_here = picture_scores(color, image, labels != 0, distance)
             rows.append(scores_here | {ALIGNED: aligned_psnr(renders, image, masks)})
         columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
