@@ -44,6 +44,7 @@ from bigs.train.presets import PRESETS
         "bench engine",
         "bench preprocess",
         "bench reconstruct",
+        "bench robustness",
     ],
 )
 def test_help(call: Callable[..., Answer], command: str) -> None:
@@ -78,6 +79,7 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "bench engine": "runs of everything",
         "bench preprocess": "simulated keypoints",
         "bench reconstruct": "growth of the cost",
+        "bench robustness": "worse masks, pictures, poses",
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:
         assert word in text

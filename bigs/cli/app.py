@@ -47,6 +47,7 @@ COMMANDS: Commands = {
         "engine": bench.bench_engine,
         "preprocess": bench.bench_preprocess,
         "reconstruct": bench.bench_reconstruct,
+        "robustness": bench.bench_robustness,
     },
 }
 # What the help says of commands that have commands of their own.

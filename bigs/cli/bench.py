@@ -125,3 +125,35 @@ def bench_preprocess(
         found = run(plan, out, status.update)
     print_tables(found.tables, out)
     fail_for(found.failed)
+
+
+def bench_robustness(
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CLIP ...")],
+    out: Path = Path("bench"),
+    damages: tuple[str, ...] = (),
+    preset: Preset = "fast",
+    hand_model: Path | None = None,
+    seed: int = 0,
+    threads: int = 0,
+) -> None:
+    """Reconstruct clips as they are and with worse masks, pictures, poses and focal length.
+
+    Args:
+        clips: clips with gt.npz; every run is scored on the clip as it is.
+        out: folder for damaged clips, runs, robustness.md and robustness.json; finished runs are kept.
+        damages: what to make worse; all, and all together, if not given.
+        preset: what to run.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        seed: of what is drawn.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.bench_robustness import RobustnessPlan
+    from bigs.commands.bench_robustness import bench_robustness as run
+    from bigs.commands.clip_damage import DAMAGES
+
+    plan = RobustnessPlan(clips, damages or tuple(DAMAGES), preset, hand_model, seed)
+    with stderr.status("starting") as status:
+        found = run(plan, out, status.update)
+    print_tables(found.tables, out)
+    fail_for(found.failed)

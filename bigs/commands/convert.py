@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -81,7 +81,8 @@ def convert(
         raise InputError(f"{source}: expected label masks (--masks), found none")
     clip, notes = _chosen(clip, plan)
     truth = read_annotation(source, clip.frame_names, hand_models) if clip.annotated else None
-    _write_clip(clip, out, hand_models, plan.width)
+    size, K = _resized(clip.width, clip.height, clip.K, plan.width)
+    write_build_clip(clip, out, hand_models, K, _pictures(clip, size), _labels(clip, size))
     if truth is not None:
         notes += _write_truth(truth, out, hand_models, plan.width)
     return [("clip", f"{clip.name}: {len(clip)} frames in {out}"), *notes]
@@ -104,18 +105,36 @@ def _chosen(clip: Clip, plan: ConvertPlan) -> tuple[Clip, list[tuple[str, str]]]
     return excerpt(clip, frames), notes
 
 
-def _write_clip(clip: Clip, out: Path, hand_models: Mapping[Side, HandModel], width: int) -> None:
-    """The clip with its tracks in HOLD's world, which is the camera turned over and shifted."""
+def write_build_clip(
+    clip: Clip,
+    out: Path,
+    hand_models: Mapping[Side, HandModel],
+    K: np.ndarray,
+    images: Iterable[np.ndarray],
+    masks: Iterable[np.ndarray],
+) -> Path:
+    """Write a clip with its tracks in HOLD's world, which is the camera turned over and shifted.
+
+    Args:
+        clip: whose tracks, camera motion and names are written.
+        out: folder that gets `build`.
+        hand_models: those of its tracks.
+        K: [3, 3] of the pictures.
+        images: T pictures [H, W, 3] uint8.
+        masks: T labels [H, W] uint8 with the values of `bigs.types.MASK_VALUES`.
+
+    Returns:
+        The build folder.
+    """
     hold_from_cam = np.eye(4)
     hold_from_cam[:3, :3], hold_from_cam[:3, 3] = GL_FROM_CV, clip.normalize_shift
     motions = hold_from_cam @ clip.cam_from_world
-    size, K = _resized(clip.width, clip.height, clip.K, width)
-    write_hold(
+    return write_hold(
         out,
         name=clip.name,
         frame_names=clip.frame_names,
-        images=_pictures(clip, size),
-        masks=_labels(clip, size),
+        images=images,
+        masks=masks,
         K=K,
         normalize_shift=clip.normalize_shift,
         hands={

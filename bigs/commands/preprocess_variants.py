@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ import numpy as np
 import scipy.ndimage
 from PIL import Image
 
+from bigs.commands.clip_damage import as_jpeg
 from bigs.data.base import Clip
 from bigs.data.excerpt import to_and_fro
 from bigs.data.limited_view import limited_frames, object_directions
@@ -182,8 +182,4 @@ def _changed(
         found = scipy.ndimage.gaussian_filter(found, (variant.blur, variant.blur, 0))
     found += _SENSOR_NOISE * rng.standard_normal(found.shape)
     image = found.round().clip(0, 255).astype(np.uint8)
-    if variant.jpeg:
-        file = io.BytesIO()
-        Image.fromarray(image).save(file, format="JPEG", quality=variant.jpeg)
-        image = np.asarray(Image.open(file))
-    return image
+    return as_jpeg(image, variant.jpeg) if variant.jpeg else image
