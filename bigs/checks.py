@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import reprlib
 import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
@@ -22,6 +24,12 @@ ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
     zipfile.BadZipFile,
     zlib.error,
 )
+
+
+# How much of a value from a file a message shows.
+_SHOWN = 80
+_BRIEFLY = reprlib.Repr()
+_BRIEFLY.maxlevel, _BRIEFLY.maxstring, _BRIEFLY.maxother, _BRIEFLY.maxlong = 3, _SHOWN, _SHOWN, _SHOWN
 
 
 class InputError(ValueError):
@@ -58,4 +66,19 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
     accepted = list(choices)
     if value not in accepted:
-        raise InputError(f"{name}: expected one of {', '.join(map(str, accepted))}, found {value!r}")
+        raise InputError(f"{name}: expected one of {', '.join(map(str, accepted))}, found {shown(value)}")
+
+
+def shown(value: Any) -> str:
+    """Somebody else's value for a message: one line, short, and without an exception whatever it is.
+
+    Python itself refuses to print integers of more than 4300 digits, and runs out of stack where lists are
+    nested deeply.
+    """
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * _SHOWN:
+        return f"an integer of about {math.ceil(value.bit_length() * math.log10(2))} digits"
+    try:
+        text = " ".join(_BRIEFLY.repr(value).split())
+    except Exception:  # a value may raise whatever it likes
+        return f"a {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

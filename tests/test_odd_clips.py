@@ -79,12 +79,14 @@ def a_hand_is_far_outside(clip: OddClip) -> None:
     clip.move("right", (30.0, 0.0, 0.0))
 
 
-def a_hand_is_behind_the_camera(clip: OddClip) -> None:
+def a_hand_is_far_away(clip: OddClip) -> None:
     clip.move("right", (0.0, 0.0, -30.0))
 
 
-def the_object_is_behind_the_camera_once(clip: OddClip) -> None:
-    clip.move("object", (0.0, 0.0, -30.0), slice(4, 5))
+def both_are_behind_the_camera_once(clip: OddClip) -> None:
+    # The file's z points backwards.
+    clip.move("right", (0.0, 0.0, 30.0), slice(7, 9))
+    clip.move("object", (0.0, 0.0, 30.0), slice(4, 5))
 
 
 @pytest.mark.parametrize(
@@ -96,8 +98,8 @@ def the_object_is_behind_the_camera_once(clip: OddClip) -> None:
         the_object_is_all_there_is,
         a_hand_leaves_the_image,
         a_hand_is_far_outside,
-        a_hand_is_behind_the_camera,
-        the_object_is_behind_the_camera_once,
+        a_hand_is_far_away,
+        both_are_behind_the_camera_once,
     ],
 )
 def test_it_ends_well(tiny_clip: Path, tmp_path: Path, make_odd: Callable[[OddClip], None]) -> None:
@@ -110,3 +112,6 @@ def test_it_ends_well(tiny_clip: Path, tmp_path: Path, make_odd: Callable[[OddCl
     assert outcome.report.retreats == []  # nothing became infinite on the way
     told = any("no frame shows the object" in line for line in outcome.report.skipped)
     assert told == (make_odd is nothing_is_labelled)
+    if make_odd is both_are_behind_the_camera_once:
+        assert "object: behind the camera in frame 4" in outcome.report.facts["estimates"]
+        assert "right hand: behind the camera in 2 frames (7, 8)" in outcome.report.facts["estimates"]

@@ -5,20 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
+
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.layouts import load_clip
+from bigs.data.plausible import plausible
 from bigs.hand import HandModel
 from bigs.types import Side
 
 
 def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
-    """A clip of any layout that `bigs.data.layouts` knows.
+    """A clip of any layout that `bigs.data.layouts` knows, single faults taken out and noted.
 
     Raises:
-        InputError: the clip is not as it should be.
+        InputError: the clip is not as it should be, or cannot be of hands before a camera.
     """
-    return load_clip(path, hand_models["right"].hands_mean.double().numpy())
+    clip = load_clip(path, hand_models["right"].hands_mean.double().numpy())
+    wrists = {
+        side: hand_models[side].rest_joints(torch.as_tensor(track.betas, dtype=torch.float32))[0].numpy()
+        for side, track in clip.hands.items()
+    }
+    return plausible(clip, wrists)
 
 
 def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:

@@ -55,4 +55,5 @@ def describe_clip(path: Path, hand_model: Path | None = None) -> list[tuple[str,
     depths = [np.einsum("tj,tj->t", to_cam[:, 2, :3], position) + to_cam[:, 2, 3] for position in positions]
     middle = np.median(np.concatenate(depths))
     rows.append(("distance", f"{middle:.2f} m, where a pixel covers {1e3 * middle / K[0, 0]:.1f} mm"))
+    rows += [("note", note) for note in clip.notes]
     return rows

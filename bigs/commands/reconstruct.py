@@ -104,6 +104,8 @@ def reconstruct(
                 if event["event"] != "resume":
                     listen(event)
 
+            for note in clip.notes:
+                log_and_listen({"event": "note", "stage": "clip", "text": f"note: {note}"})
             scene, report = fit(
                 clip,
                 hand_models,
@@ -114,6 +116,8 @@ def reconstruct(
                 resume=resume,
                 listen=log_and_listen,
             )
+            if clip.notes:
+                report.facts["estimates"] = "; ".join(clip.notes)
             playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)

@@ -69,6 +69,7 @@ class Clip:
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files; all have a key
     annotated: bool = False  # the tracks are a dataset's truth, which no reconstruction may start from
     optics: Optics | None = None  # how the files differ from the pictures, where they do
+    notes: tuple[str, ...] = ()  # what of the estimates was odd, or was taken out (see `plausible`)
 
     def __len__(self) -> int:
         return len(self.image_paths)

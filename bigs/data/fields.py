@@ -14,7 +14,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape
+from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape, shown
+
+# Metres, pixels, radians, counts: no honest number is larger, and squares of larger ones leave float32.
+LARGEST = 1e15
 
 
 def mapping_field(where: str, value: Any) -> Mapping[str, Any]:
@@ -26,20 +29,49 @@ def mapping_field(where: str, value: Any) -> Mapping[str, Any]:
 
 def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: bool = True) -> np.ndarray:
     """`value` (numpy or torch) as float64 of `shape`, finite unless told otherwise, else an InputError."""
-    array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"{where}: expected an array of numbers, found {type(value).__name__}")
+    array = _numbers(where, value)
     check_shape(where, array, shape)
-    array = array.astype(np.float64)
     if finite:
         check_finite(where, array)
     return array
 
 
+def number_field(where: str, value: Any) -> float:
+    """`value` as a finite number, alone or in an array; a truth value is none. Else an InputError."""
+    array = _numbers(where, value)
+    if array.size != 1 or isinstance(value, bool | np.bool_):
+        raise InputError(f"{where}: expected one number, found {shown(value)}")
+    check_finite(where, array.reshape(()))
+    return float(array.reshape(()))
+
+
+def _numbers(where: str, value: Any) -> np.ndarray:
+    """`value` as float64, NaN and infinities as they are."""
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
+        # Rows of different lengths, and tensors that numpy does not know.
+        raise InputError(f"{where}: expected an array of numbers, found another thing ({error})") from None
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"{where}: expected an array of numbers, found {_kind(value, array)}")
+    with np.errstate(over="ignore"):  # of wider floats, which then are infinite
+        array = array.astype(np.float64)
+    largest = np.abs(array[np.isfinite(array)]).max(initial=0.0)
+    if largest > LARGEST:
+        raise InputError(f"{where}: expected numbers of at most {LARGEST:g}, found {largest:.3g}")
+    return array
+
+
+def _kind(value: Any, array: np.ndarray) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array of {array.dtype}"
+    return shown(value) if isinstance(value, int) else type(value).__name__
+
+
 def require(where: str, values: Mapping[str, Any], key: str) -> Any:
     """`values[key]`, or an InputError that lists what is there; `where` names the key in full."""
     if key not in values:
-        keys = [str(key) for key in values]
+        keys = [key if isinstance(key, str) else shown(key) for key in values]
         found = ", ".join(keys[:8]) + (", ..." if len(keys) > 8 else "")
         raise InputError(f"{where}: expected this field, found {f'only {found}' if keys else 'no fields'}")
     return values[key]
@@ -53,7 +85,7 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: expected a {path.name}, found no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a readable text file, found {error}") from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a plain ValueError of integers beyond 4300 digits
         raise InputError(f"{path}: expected JSON, found {error}") from None
 
 

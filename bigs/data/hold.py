@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import array_field, mapping_field, number_field, require
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -259,10 +259,10 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
 
 
 def _read_scale(where: str, stored: Any) -> float:
-    scale = array_field(where, np.ravel(stored), (1,))
-    if scale[0] <= 0:
-        raise InputError(f"{where}: expected a positive number, found {scale[0]:g}")
-    return float(scale[0])
+    scale = number_field(where, stored)
+    if scale <= 0:
+        raise InputError(f"{where}: expected a positive number, found {scale:g}")
+    return scale
 
 
 def _read_colors(where: str, stored: Any, count: int) -> np.ndarray:
