@@ -1,6 +1,6 @@
 //! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied.
 
-use bigs_raster::{BatchInputs, BatchShape, CameraModel, Real, Slabs};
+use bigs_raster::{BatchInputs, BatchShape, CameraModel, Scalar, Slabs};
 use numpy::{
     Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
@@ -40,7 +40,7 @@ const NAMES: [&str; 7] = [
     "Ks",
 ];
 
-impl<'py, T: Real + Element> Arrays<'py, T> {
+impl<'py, T: Scalar + Element> Arrays<'py, T> {
     /// Reads (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds | None, pixel_mask | None).
     pub(crate) fn extract(arrays: &Bound<'py, PyTuple>, counts: [Count; NAMES.len() + 2]) -> PyResult<Self> {
         if arrays.len() != NAMES.len() + 2 {

@@ -6,7 +6,7 @@ mod sh;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use bigs_raster::{Batch, BatchState, CameraModel, RasterError, RasterSettings, Real, RenderMode, Wanted};
+use bigs_raster::{Batch, BatchState, CameraModel, RasterError, RasterSettings, RenderMode, Wanted};
 use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -25,12 +25,12 @@ enum Kept {
 }
 
 /// The scalars that arrays may have.
-trait Scalar: Real + numpy::Element {
+trait Kind: bigs_raster::Scalar + numpy::Element {
     fn keep(state: BatchState<Self>) -> Kept;
     fn kept(state: &Kept) -> Option<&BatchState<Self>>;
 }
 
-impl Scalar for f32 {
+impl Kind for f32 {
     fn keep(state: BatchState<Self>) -> Kept {
         Kept::Single(state)
     }
@@ -42,7 +42,7 @@ impl Scalar for f32 {
     }
 }
 
-impl Scalar for f64 {
+impl Kind for f64 {
     fn keep(state: BatchState<Self>) -> Kept {
         Kept::Double(state)
     }
@@ -114,7 +114,7 @@ fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + 
         .map_err(value_error)
 }
 
-fn forward<'py, T: Scalar>(
+fn forward<'py, T: Kind>(
     py: Python<'py>,
     arrays: &Arrays<'py, T>,
     lead: &[usize],
@@ -177,7 +177,7 @@ fn rasterize_forward<'py>(
     }
 }
 
-fn backward<'py, T: Scalar>(
+fn backward<'py, T: Kind>(
     py: Python<'py>,
     state: &BatchState<T>,
     arrays: &Arrays<'py, T>,

@@ -1,6 +1,6 @@
 //! Spherical harmonics: the Python face of `bigs_raster::Harmonics`.
 
-use bigs_raster::{Harmonics, Real};
+use bigs_raster::{Harmonics, Scalar};
 use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -16,7 +16,7 @@ struct Arrays<'py, T: Element> {
     mask: Option<PyReadonlyArrayDyn<'py, bool>>,
 }
 
-impl<'py, T: Real + Element> Arrays<'py, T> {
+impl<'py, T: Scalar + Element> Arrays<'py, T> {
     /// Reads (dirs, coefficients, mask | None).
     fn extract(arrays: &Bound<'py, PyTuple>) -> PyResult<Self> {
         let mask = arrays.get_item(2)?;
@@ -47,7 +47,7 @@ impl<'py, T: Real + Element> Arrays<'py, T> {
     }
 }
 
-fn forward<'py, T: Real + Element>(
+fn forward<'py, T: Scalar + Element>(
     py: Python<'py>,
     degree: usize,
     arrays: &Arrays<'py, T>,
@@ -71,7 +71,7 @@ pub(crate) fn harmonics_forward<'py>(
     }
 }
 
-fn backward<'py, T: Real + Element>(
+fn backward<'py, T: Scalar + Element>(
     py: Python<'py>,
     degree: usize,
     arrays: &Arrays<'py, T>,

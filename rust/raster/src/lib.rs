@@ -98,54 +98,36 @@
     )
 )]
 
-mod batch;
-mod batch_vjp;
-mod binned;
-mod bins;
-mod camera;
-mod chunk;
-mod compiled;
+mod api;
+mod backproject;
+mod color;
 mod composite;
-mod composite_vjp;
-mod cov;
-mod dispatch;
 mod error;
-mod gather;
-mod gaussians;
-mod kernel;
-mod levels;
-mod median;
-pub mod peak;
-mod pool;
+mod input;
+mod lists;
+mod math;
+mod memory;
+mod pipeline;
 mod project;
-mod project_vjp;
-mod real;
-mod renderer;
-mod scene;
-mod settings;
-mod sh;
-mod sh_basis;
-mod shared;
-mod slabs;
-mod slots;
-mod sort;
-pub mod stages;
-mod tiles;
-mod vector;
-mod view;
+mod simd;
 
-pub use batch::{Batch, BatchImages, BatchState, Counters};
-pub use batch_vjp::{BatchGradients, Wanted};
-pub use camera::{Camera, CameraModel, Intrinsics};
+pub use api::batch::{Batch, BatchImages, BatchState, Counters};
+pub use api::batch_inputs::{BatchInputs, BatchShape, Slabs};
+pub use api::batch_vjp::{BatchGradients, Wanted};
+pub use api::harmonics::Harmonics;
+pub use api::renderer::{Frame, GaussianGrads, Renderer};
+pub use api::stages;
+pub use color::harmonics::HarmonicsGradients;
 pub use error::RasterError;
-pub use gaussians::Gaussians;
-pub use pool::release_memory;
-pub use real::Real;
-pub use renderer::{Frame, GaussianGrads, Renderer};
-pub use settings::{RasterSettings, RenderMode};
-pub use sh::{Harmonics, HarmonicsGradients};
-pub use slabs::{BatchInputs, BatchShape, Slabs};
-pub use sort::{RadixKey, radix_sort};
+pub use input::camera::{Camera, CameraModel, Intrinsics};
+pub use input::gaussians::Gaussians;
+pub use input::settings::{RasterSettings, RenderMode};
+pub use lists::radix_sort::radix_sort;
+pub use math::radix_key::RadixKey;
+pub use math::real::Real;
+pub use memory::pool::release_memory;
+pub use pipeline::scalar::Scalar;
+pub use simd::peak;
 
 /// The README's code is compiled and run with the documentation's.
 #[cfg(doctest)]

@@ -5,7 +5,7 @@ mod fuzz;
 mod support;
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, CameraModel, GaussianGrads, RasterSettings, Real, RenderMode, Renderer,
+    Batch, BatchInputs, BatchShape, CameraModel, GaussianGrads, RasterSettings, RenderMode, Renderer, Scalar,
     Slabs, Wanted,
 };
 use proptest::prelude::*;
@@ -14,7 +14,7 @@ use support::{Random, Scene, VIEWMAT, camera, intrinsics, naive, relative};
 const WIDTH: usize = 46;
 const HEIGHT: usize = 35;
 
-fn render<T: Real>(
+fn render<T: Scalar>(
     scene: &Scene<T>,
     viewmat: [[f64; 4]; 4],
     settings: &RasterSettings,
@@ -149,7 +149,7 @@ proptest! {
 }
 
 /// Everything a batch returns, as bits.
-fn batch_bits<T: Real>(threads: usize, mode: RenderMode, channels: usize, masked: bool) -> Vec<u64> {
+fn batch_bits<T: Scalar>(threads: usize, mode: RenderMode, channels: usize, masked: bool) -> Vec<u64> {
     let shape = BatchShape {
         entries: 2,
         cameras: 2,

@@ -2,7 +2,7 @@
 
 use bigs_raster::{
     Batch, BatchInputs, BatchShape, Camera, CameraModel, Gaussians, Intrinsics, RasterError, RasterSettings,
-    Real, RenderMode, Renderer, Slabs, Wanted,
+    RenderMode, Renderer, Scalar, Slabs, Wanted,
 };
 
 use super::dice::{Dice, Wildness, number, scalar};
@@ -71,7 +71,7 @@ fn settings(dice: &mut Dice, wildness: Wildness) -> RasterSettings {
     s
 }
 
-impl<T: Real> Case<T> {
+impl<T: Scalar> Case<T> {
     /// The case of a seed.
     pub fn new(seed: u64) -> Self {
         let dice = &mut Dice::new(seed);

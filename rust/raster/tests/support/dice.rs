@@ -1,6 +1,6 @@
 //! Random numbers, ordinary and wild.
 
-use bigs_raster::Real;
+use bigs_raster::Scalar;
 
 /// splitmix64: every seed is a good one.
 pub struct Dice(u64);
@@ -77,7 +77,7 @@ pub fn number(dice: &mut Dice, wildness: Wildness, low: f64, high: f64) -> f64 {
 }
 
 /// A number of the scalar; what only overflows on the way to it is brought back, unless bits are wanted.
-pub fn scalar<T: Real>(dice: &mut Dice, wildness: Wildness, low: f64, high: f64) -> T {
+pub fn scalar<T: Scalar>(dice: &mut Dice, wildness: Wildness, low: f64, high: f64) -> T {
     let value = T::of(number(dice, wildness, low, high));
     if wildness != Wildness::Bits && !value.is_finite() {
         T::of(usual_middle(low, high))

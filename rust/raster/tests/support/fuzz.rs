@@ -8,16 +8,16 @@ pub mod dice;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use bigs_raster::Real;
+use bigs_raster::Scalar;
 
 pub use case::Case;
 
-fn bits<T: Real>(values: &[T]) -> Vec<u64> {
+fn bits<T: Scalar>(values: &[T]) -> Vec<u64> {
     values.iter().map(|v| v.as_f64().to_bits()).collect()
 }
 
 /// Renders the case of a seed in every way and says what is wrong with the result; `Ok(true)` if there was an image.
-pub fn check<T: Real>(seed: u64, pools: &[rayon::ThreadPool]) -> Result<bool, String> {
+pub fn check<T: Scalar>(seed: u64, pools: &[rayon::ThreadPool]) -> Result<bool, String> {
     let case = Case::<T>::new(seed);
     let render_in = |pool: &rayon::ThreadPool| {
         catch_unwind(AssertUnwindSafe(|| pool.install(|| case.render())))

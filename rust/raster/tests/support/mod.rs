@@ -1,7 +1,7 @@
 //! Scenes and a naive renderer for the integration tests.
 #![allow(dead_code, unreachable_pub)]
 
-use bigs_raster::{Camera, CameraModel, Gaussians, Intrinsics, RasterSettings, Real};
+use bigs_raster::{Camera, CameraModel, Gaussians, Intrinsics, RasterSettings, Scalar};
 
 /// xorshift64*: random numbers without a dependency.
 pub struct Random(u64);
@@ -31,7 +31,7 @@ pub struct Scene<T> {
     pub channels: usize,
 }
 
-impl<T: Real> Scene<T> {
+impl<T: Scalar> Scene<T> {
     pub fn random(n: usize, channels: usize, seed: u64) -> Self {
         let mut r = Random::new(seed);
         let mut next = |low: f64, high: f64| T::of(r.uniform(low, high));
@@ -74,7 +74,7 @@ pub fn intrinsics(width: usize, height: usize) -> [f64; 4] {
     [f, 1.05 * f, 0.48 * width as f64, 0.53 * height as f64]
 }
 
-pub fn camera<T: Real>(viewmat: [[f64; 4]; 4], width: usize, height: usize) -> Camera<T> {
+pub fn camera<T: Scalar>(viewmat: [[f64; 4]; 4], width: usize, height: usize) -> Camera<T> {
     let [fx, fy, cx, cy] = intrinsics(width, height).map(T::of);
     Camera::new(
         viewmat.map(|row| row.map(T::of)),
@@ -209,7 +209,7 @@ pub fn naive_with(
 }
 
 /// Relative L2 difference.
-pub fn relative<T: Real>(got: &[T], expected: &[f64]) -> f64 {
+pub fn relative<T: Scalar>(got: &[T], expected: &[f64]) -> f64 {
     assert_eq!(got.len(), expected.len());
     let difference: f64 = got
         .iter()

@@ -1,0 +1,202 @@
+//! The vjp of a batch: gradients view by view, summed where views share an input.
+
+use rayon::prelude::*;
+
+use crate::api::batch::{Batch, BatchState, split};
+use crate::api::batch_inputs::Slabs;
+use crate::backproject::gradients::ViewGradients;
+use crate::composite::backward::Cotangents;
+use crate::error::RasterError;
+use crate::input::gaussians::check_length;
+use crate::memory::pool::{Buffers, Pooled, bytes_of};
+use crate::pipeline::scalar::Scalar;
+use crate::pipeline::view::render_view_vjp;
+
+/// Which gradients are asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub struct Wanted {
+    pub means: bool,
+    pub quats: bool,
+    pub scales: bool,
+    pub opacities: bool,
+    pub colors: bool,
+    pub viewmats: bool,
+    pub backgrounds: bool,
+    pub means2d: bool,
+    /// Leave what passes through `means2d` out of the other gradients, for a caller that sends it on.
+    pub detach_means2d: bool,
+    pub absgrad: bool,
+}
+
+/// Gradients of a batch's inputs, each in the layout of its input; empty if not asked for. A shared input has the sum
+/// over the views that share it, in order.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct BatchGradients<T> {
+    pub means: Vec<T>,
+    pub quats: Vec<T>,
+    pub scales: Vec<T>,
+    pub opacities: Vec<T>,
+    pub colors: Vec<T>,
+    /// Three rows of four per matrix: the last row of a world-to-camera matrix is constant.
+    pub viewmats: Vec<T>,
+    pub backgrounds: Vec<T>,
+    /// Of the centres on screen: views, Gaussians, x and y per pixel.
+    pub means2d: Vec<T>,
+    /// Sums over pixels of the absolute values of what `means2d` sums, in its layout. With more than eight channels a
+    /// pixel's part is that of eight at a time.
+    pub absgrad: Vec<T>,
+    /// Tiles of all views whose incoming gradient was zero.
+    pub tiles_skipped: usize,
+}
+
+/// Nothing but zeros, for gradients that nobody gave.
+#[derive(Debug, Default)]
+struct Zeros<T>(Vec<T>);
+
+impl<T: Scalar> Zeros<T> {
+    fn of(&mut self, len: usize) -> &[T] {
+        if self.0.len() < len {
+            self.0.resize(len, T::ZERO);
+        }
+        &self.0[..len]
+    }
+}
+
+impl<T: Scalar> Buffers for Zeros<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.0)
+    }
+}
+
+fn rows_mut<const N: usize, T>(slab: &mut [T]) -> &mut [[T; N]] {
+    slab.as_chunks_mut().0
+}
+
+impl<T: Scalar> Batch<'_, T> {
+    /// Gradients of a loss, given its gradients with respect to the colours and alphas of [`Batch::render`]; `None`
+    /// stands for zeros.
+    ///
+    /// # Errors
+    /// Gradients whose length is not that of the images.
+    pub fn render_vjp(
+        &self,
+        state: &BatchState<T>,
+        v_colors: Option<&[T]>,
+        v_alphas: Option<&[T]>,
+        wanted: Wanted,
+    ) -> Result<BatchGradients<T>, RasterError> {
+        let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
+        let total = self.shape.image_channels(self.mode);
+        let mut zeros = Pooled::<Zeros<T>>::take();
+        let v_colors_size = views * pixels * total;
+        let zeros = zeros.of(match (v_colors, v_alphas) {
+            (None, _) => v_colors_size.max(views * pixels),
+            (_, None) => views * pixels,
+            _ => 0,
+        });
+        let v_colors = v_colors.unwrap_or_else(|| &zeros[..v_colors_size]);
+        let v_alphas = v_alphas.unwrap_or_else(|| &zeros[..views * pixels]);
+        check_length("v_colors", v_colors_size, v_colors.len())?;
+        check_length("v_alphas", views * pixels, v_alphas.len())?;
+
+        // One slab per view, summed where views share an input.
+        let buffer = |wanted: bool, size: usize| vec![T::ZERO; if wanted { views * size } else { 0 }];
+        let mut means = buffer(wanted.means, 3 * n);
+        let mut quats = buffer(wanted.quats, 4 * n);
+        let mut scales = buffer(wanted.scales, 3 * n);
+        let mut opacities = buffer(wanted.opacities, n);
+        let mut colors = buffer(wanted.colors, self.shape.channels * n);
+        let mut viewmats = buffer(wanted.viewmats, 12);
+        let mut backgrounds = buffer(wanted.backgrounds, self.shape.channels);
+        let mut means2d = buffer(wanted.means2d, 2 * n);
+        let mut absgrad = buffer(wanted.absgrad, 2 * n);
+        let geometry = (
+            split(&mut means, views),
+            split(&mut quats, views),
+            split(&mut scales, views),
+            split(&mut opacities, views),
+        );
+        let rest = (
+            split(&mut colors, views),
+            split(&mut viewmats, views),
+            split(&mut backgrounds, views),
+            split(&mut means2d, views),
+            split(&mut absgrad, views),
+        );
+        let tiles_skipped = (geometry.into_par_iter(), rest.into_par_iter())
+            .into_par_iter()
+            .enumerate()
+            .map(
+                |(
+                    view,
+                    ((means, quats, scales, opacities), (colors, viewmat, background, means2d, absgrad)),
+                )| {
+                    let v = Cotangents {
+                        colors: &v_colors[view * pixels * total..][..pixels * total],
+                        alphas: &v_alphas[view * pixels..][..pixels],
+                    };
+                    let out = ViewGradients {
+                        means: rows_mut(means),
+                        quats: rows_mut(quats),
+                        scales: rows_mut(scales),
+                        opacities,
+                        colors,
+                        viewmat,
+                        background,
+                        means2d: rows_mut(means2d),
+                        detach_means2d: wanted.detach_means2d,
+                        absgrad: rows_mut(absgrad),
+                    };
+                    let state = &state.views[view];
+                    render_view_vjp(&self.view(view), self.mode, &self.limits, state, v, out)
+                },
+            )
+            .sum();
+        let inputs = &self.inputs;
+        Ok(BatchGradients {
+            means: self.shared(means, &inputs.means),
+            quats: self.shared(quats, &inputs.quats),
+            scales: self.shared(scales, &inputs.scales),
+            opacities: self.shared(opacities, &inputs.opacities),
+            colors: self.shared(colors, &inputs.colors),
+            viewmats: self.shared(viewmats, &inputs.viewmats),
+            backgrounds: match &inputs.backgrounds {
+                Some(slabs) => self.shared(backgrounds, slabs),
+                None => backgrounds,
+            },
+            means2d,
+            absgrad,
+            tiles_skipped,
+        })
+    }
+
+    /// Sums gradients per view into gradients per slab, views in order.
+    fn shared(&self, per_view: Vec<T>, slabs: &Slabs<'_, T>) -> Vec<T> {
+        /// Elements summed by one task.
+        const PART: usize = 4096;
+        let views = self.shape.views();
+        if slabs.count() == views || per_view.is_empty() {
+            return per_view;
+        }
+        let size = per_view.len() / views;
+        let mut sums = vec![T::ZERO; slabs.count() * size];
+        for (index, slab) in sums.chunks_exact_mut(size).enumerate() {
+            let sharing: Vec<&[T]> = per_view
+                .chunks_exact(size)
+                .enumerate()
+                .filter(|&(view, _)| slabs.index(view, self.shape.cameras) == index)
+                .map(|(_, values)| values)
+                .collect();
+            slab.par_chunks_mut(PART).enumerate().for_each(|(part, sums)| {
+                for values in &sharing {
+                    for (sum, &v) in sums.iter_mut().zip(&values[part * PART..]) {
+                        *sum += v;
+                    }
+                }
+            });
+        }
+        sums
+    }
+}

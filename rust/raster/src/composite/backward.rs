@@ -1,0 +1,227 @@
+//! The vjp of `composite`: from the gradient of an image to one slot per (tile, splat).
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+
+use crate::composite::dispatch;
+use crate::composite::forward::{Canvas, LEAST_ALPHA, cut};
+use crate::composite::kernel::{BLOCK, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane};
+use crate::composite::scene::Scene;
+use crate::composite::slots::{Slots, slot_size};
+use crate::math::real::Real;
+use crate::memory::pool::Pooled;
+use crate::simd::Vectors;
+use crate::simd::level::SimdLevel;
+
+/// Gradients of an image.
+#[derive(Clone, Copy)]
+pub(crate) struct Cotangents<'a, T> {
+    /// As the image: rows, columns, channels.
+    pub(crate) colors: &'a [T],
+    pub(crate) alphas: &'a [T],
+}
+
+/// What the compositor's vjp yields.
+#[derive(Debug)]
+pub(crate) struct CompositeGradients<T: Real> {
+    pub(crate) slots: Pooled<Slots<T>>,
+    pub(crate) background: Vec<T>,
+    /// Tiles whose incoming gradient was zero.
+    pub(crate) tiles_skipped: usize,
+}
+
+/// Cuts a buffer into one piece per tile, `size` values per entry of the tile's list.
+fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], size: usize) -> Vec<&'a mut [U]> {
+    offsets
+        .windows(2)
+        .map(|pair| cut(&mut buffer, (pair[1] - pair[0]) as usize * size))
+        .collect()
+}
+
+/// The vjp of [`crate::composite::forward::composite`].
+pub(crate) fn composite_vjp<T: Vectors>(
+    scene: &Scene<'_, T>,
+    canvas: &Canvas<T>,
+    v: Cotangents<'_, T>,
+    absolute: bool,
+) -> CompositeGradients<T> {
+    let level = SimdLevel::detect();
+    let blocks = scene.blocks();
+    let total = scene.channels.total;
+    let size = slot_size(total, absolute);
+    let mut slots = Pooled::<Slots<T>>::take();
+    let values = slots.values(scene.bins.ranks.len() * size);
+    let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
+    let tiles_skipped = AtomicUsize::new(0);
+    (
+        pieces_by_tile(values, &scene.bins.offsets, size),
+        backgrounds.par_chunks_mut(total),
+    )
+        .into_par_iter()
+        .enumerate()
+        .for_each_init(TileGradients::new, |incoming, (tile, (slots, v_background))| {
+            let mut task = scene.task(tile);
+            if task.ranks.is_empty() && scene.background.is_none() {
+                return;
+            }
+            let own = tile * blocks..(tile + 1) * blocks;
+            let transmittance = &canvas.transmittance[own.clone()];
+            let mut skipped = true;
+            while task.first < total {
+                let any = incoming.load(scene, canvas, tile, task.first, v);
+                if scene.background.is_some() {
+                    for k in 0..(total - task.first).min(MAX_CHANNELS) {
+                        v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
+                    }
+                }
+                if !any {
+                    clear(slots, size, task.first, total);
+                } else if !task.ranks.is_empty() {
+                    skipped = false;
+                    let cotangents = TileCotangents {
+                        transmittance,
+                        end: &canvas.end[own.clone()],
+                        masks: &canvas.masks
+                            [scene.bins.offsets[tile] as usize..scene.bins.offsets[tile + 1] as usize],
+                        v_values: &incoming.v_values,
+                        v_transmittance: &incoming.v_transmittance,
+                    };
+                    dispatch::backward(level, &task, &cotangents, slots, size, absolute);
+                }
+                task.first += MAX_CHANNELS;
+            }
+            if skipped && !task.ranks.is_empty() {
+                tiles_skipped.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+    let mut background = vec![T::ZERO; scene.channels.colored];
+    for tile in backgrounds.chunks_exact(total) {
+        for (sum, &v) in background.iter_mut().zip(tile) {
+            *sum += v;
+        }
+    }
+    CompositeGradients {
+        slots,
+        background,
+        tiles_skipped: tiles_skipped.into_inner(),
+    }
+}
+
+/// Zeroes what a kernel would have written for the channels of the group that starts with `first`.
+fn clear<T: Real>(slots: &mut [T], size: usize, first: usize, total: usize) {
+    if first == 0 {
+        slots.fill(T::ZERO);
+        return;
+    }
+    for slot in slots.chunks_exact_mut(size) {
+        slot[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
+    }
+}
+
+fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
+    let products = a
+        .iter()
+        .zip(b)
+        .flat_map(|(a, b)| a.0.iter().zip(&b.0).map(|(&a, &b)| a * b));
+    products.sum()
+}
+
+/// The incoming gradients of one tile, for one group of channels.
+struct TileGradients<T> {
+    v_values: [TilePlane<T>; MAX_CHANNELS],
+    v_transmittance: TilePlane<T>,
+}
+
+impl<T: Real> TileGradients<T> {
+    fn new() -> Self {
+        Self {
+            v_values: [[Lanes::ZERO; MAX_BLOCKS]; MAX_CHANNELS],
+            v_transmittance: [Lanes::ZERO; MAX_BLOCKS],
+        }
+    }
+
+    /// Reads the channels from `first` on; whether any gradient is not zero.
+    fn load(
+        &mut self,
+        scene: &Scene<'_, T>,
+        canvas: &Canvas<T>,
+        tile: usize,
+        first: usize,
+        v: Cotangents<'_, T>,
+    ) -> bool {
+        let total = scene.channels.total;
+        let whole = scene.pixel_mask.is_none()
+            && scene.grid.origin(tile).0 + scene.grid.tile_size <= scene.grid.width
+            && scene.grid.origin(tile).1 + scene.grid.tile_size <= scene.grid.height;
+        if whole && !scene.expected_depth && scene.background.is_none() && first == 0 {
+            match total {
+                1 => return self.load_whole::<1>(scene, tile, v),
+                3 => return self.load_whole::<3>(scene, tile, v),
+                4 => return self.load_whole::<4>(scene, tile, v),
+                _ => {}
+            }
+        }
+        let used = (total - first).min(MAX_CHANNELS);
+        let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
+        *self = Self::new();
+        let mut any = false;
+        let least = T::of(LEAST_ALPHA);
+        scene.for_block_rows(tile, |block, lane, pixel, count| {
+            for i in 0..count {
+                let (pixel, lane) = (pixel + i, lane + i);
+                if !scene.pixel_mask.is_none_or(|mask| mask[pixel]) {
+                    continue;
+                }
+                // Alpha is 1 − transmittance; it belongs to the first group of channels.
+                let mut v_alpha = if first == 0 { v.alphas[pixel] } else { T::ZERO };
+                let mut v_transmittance = T::ZERO;
+                let incoming = &v.colors[pixel * total + first..][..used];
+                for k in 0..used {
+                    let mut value = incoming[k];
+                    if scene.expected_depth && first + k == total - 1 {
+                        let place = tile * scene.blocks() + block;
+                        let alpha = T::ONE - canvas.transmittance[place].0[lane];
+                        value = value / alpha.greater(least);
+                        if alpha > least {
+                            v_alpha += -(value * (canvas.depths[place].0[lane] / alpha));
+                        }
+                    }
+                    self.v_values[k][block].0[lane] = value;
+                    v_transmittance += value * background[k];
+                    any |= value != T::ZERO;
+                }
+                any |= v_alpha != T::ZERO;
+                self.v_transmittance[block].0[lane] = v_transmittance + -v_alpha;
+            }
+        });
+        any
+    }
+
+    /// A tile within the image, all of whose K channels are colours over black or plain depth.
+    fn load_whole<const K: usize>(
+        &mut self,
+        scene: &Scene<'_, T>,
+        tile: usize,
+        v: Cotangents<'_, T>,
+    ) -> bool {
+        let mut any = false;
+        let colors = v.colors.as_chunks::<K>().0;
+        scene.for_block_rows(tile, |block, lane, pixel, _| {
+            let (Some(colors), Some(alphas)) = (
+                colors[pixel..].first_chunk::<BLOCK>(),
+                v.alphas[pixel..].first_chunk::<BLOCK>(),
+            ) else {
+                return;
+            };
+            for k in 0..K {
+                let values = std::array::from_fn(|i| colors[i][k]);
+                any |= values != [T::ZERO; BLOCK];
+                self.v_values[k][block].rows_mut()[lane / BLOCK] = values;
+            }
+            any |= *alphas != [T::ZERO; BLOCK];
+            self.v_transmittance[block].rows_mut()[lane / BLOCK] = std::array::from_fn(|i| -alphas[i]);
+        });
+        any
+    }
+}

@@ -1,0 +1,260 @@
+//! All tiles of a view, front to back: from splats to an image.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+
+use crate::composite::dispatch::{self, SPARE_CHANNELS};
+use crate::composite::kernel::{BLOCK, Lanes, MAX_CHANNELS, MAX_SIDE, TileImage};
+use crate::composite::scene::Scene;
+use crate::math::real::Real;
+use crate::memory::pool::{Buffers, Pooled, bytes_of, stale};
+use crate::simd::Vectors;
+use crate::simd::level::SimdLevel;
+
+/// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
+pub(crate) const LEAST_ALPHA: f64 = 1e-10;
+
+/// What the backward pass needs of the composited tiles. Tile-major, a block of pixels in each `Lanes`.
+#[derive(Debug)]
+pub(crate) struct Canvas<T> {
+    /// Not set for a tile that nothing reaches, unless there is a background.
+    pub(crate) transmittance: Vec<Lanes<T>>,
+    /// See [`TileImage`]; not set for a tile that nothing reaches.
+    pub(crate) end: Vec<Lanes<T>>,
+    /// Blocks reached, per entry of `TileLists::ranks`.
+    pub(crate) masks: Vec<u16>,
+    /// Accumulated depth where the image has expected depth, else empty; set as transmittance is.
+    pub(crate) depths: Vec<Lanes<T>>,
+    /// Pixels at which the light ended before the list did.
+    pub(crate) saturated: usize,
+}
+
+impl<T> Default for Canvas<T> {
+    fn default() -> Self {
+        Self {
+            transmittance: Vec::new(),
+            end: Vec::new(),
+            masks: Vec::new(),
+            depths: Vec::new(),
+            saturated: 0,
+        }
+    }
+}
+
+impl<T: Real> Buffers for Canvas<T> {
+    fn bytes(&self) -> usize {
+        let lanes = [&self.transmittance, &self.end, &self.depths];
+        lanes.map(bytes_of).iter().sum::<usize>() + bytes_of(&self.masks)
+    }
+}
+
+/// Consecutive tiles of one row of tiles: their rows of the image, and their part of the canvas.
+struct Strip<'a, T> {
+    tile: usize,
+    tiles: usize,
+    colors: [&'a mut [T]; MAX_SIDE],
+    alphas: [&'a mut [T]; MAX_SIDE],
+    transmittance: &'a mut [Lanes<T>],
+    end: &'a mut [Lanes<T>],
+    depths: &'a mut [Lanes<T>],
+    masks: &'a mut [u16],
+}
+
+/// Takes the first values off, or all there are: what nobody asked for is empty.
+pub(crate) fn cut<'a, U>(slice: &mut &'a mut [U], at: usize) -> &'a mut [U] {
+    let at = at.min(slice.len());
+    let (head, tail) = std::mem::take(slice).split_at_mut(at);
+    *slice = tail;
+    head
+}
+
+impl<'a, T: Real> Strip<'a, T> {
+    /// Takes the first `tiles` tiles off.
+    fn take(&mut self, scene: &Scene<'_, T>, tiles: usize) -> Self {
+        let (blocks, offsets) = (scene.blocks(), &scene.bins.offsets);
+        let pixels = tiles * scene.grid.tile_size;
+        let total = scene.channels.total;
+        let entries = offsets[self.tile + tiles] - offsets[self.tile];
+        let head = Self {
+            tile: self.tile,
+            tiles,
+            colors: std::array::from_fn(|y| cut(&mut self.colors[y], pixels * total)),
+            alphas: std::array::from_fn(|y| cut(&mut self.alphas[y], pixels)),
+            transmittance: cut(&mut self.transmittance, tiles * blocks),
+            end: cut(&mut self.end, tiles * blocks),
+            depths: cut(&mut self.depths, tiles * blocks),
+            masks: cut(&mut self.masks, entries as usize),
+        };
+        self.tile += tiles;
+        self.tiles -= tiles;
+        head
+    }
+
+    fn halves(mut self, scene: &Scene<'_, T>) -> (Self, Option<Self>) {
+        if self.tiles < 2 {
+            return (self, None);
+        }
+        let head = self.take(scene, self.tiles / 2);
+        (head, Some(self))
+    }
+}
+
+/// Composites every tile over the background into the image, which holds zeros where no Gaussian reaches.
+pub(crate) fn composite<T: Vectors>(
+    scene: &Scene<'_, T>,
+    colors: &mut [T],
+    alphas: &mut [T],
+) -> Pooled<Canvas<T>> {
+    let grid = &scene.grid;
+    let blocks = grid.len() * scene.blocks();
+    let total = scene.channels.total;
+    let mut canvas = Pooled::<Canvas<T>>::take();
+    let out = &mut *canvas;
+    let mut rest = Strip {
+        tile: 0,
+        tiles: grid.len(),
+        colors: Default::default(),
+        alphas: Default::default(),
+        transmittance: stale(&mut out.transmittance, blocks),
+        end: stale(&mut out.end, blocks),
+        depths: stale(&mut out.depths, if scene.expected_depth { blocks } else { 0 }),
+        masks: stale(&mut out.masks, scene.bins.ranks.len()),
+    };
+    let strips: Vec<Strip<'_, T>> = colors
+        .chunks_mut(grid.tile_size * grid.width * total)
+        .zip(alphas.chunks_mut(grid.tile_size * grid.width))
+        .map(|(colors, alphas)| {
+            let mut strip = rest.take(scene, grid.columns);
+            for (row, colors) in strip.colors.iter_mut().zip(colors.chunks_mut(grid.width * total)) {
+                *row = colors;
+            }
+            for (row, alphas) in strip.alphas.iter_mut().zip(alphas.chunks_mut(grid.width)) {
+                *row = alphas;
+            }
+            strip
+        })
+        .collect();
+    let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
+    let planes = || vec![Lanes::ZERO; (total + SPARE_CHANNELS) * scene.blocks()];
+    let saturated = AtomicUsize::new(0);
+    strips
+        .into_par_iter()
+        .flat_map(|strip| rayon::iter::split(strip, |strip| strip.halves(scene)))
+        .for_each_init(planes, |planes, mut strip| {
+            while strip.tiles > 0 {
+                let tile = strip.take(scene, 1);
+                saturated.fetch_add(
+                    composite_tile(scene, &background, planes, tile),
+                    Ordering::Relaxed,
+                );
+            }
+        });
+    out.saturated = saturated.into_inner();
+    canvas
+}
+
+/// Composites one tile; returns how many of its pixels are saturated.
+fn composite_tile<T: Vectors>(
+    scene: &Scene<'_, T>,
+    background: &[T],
+    planes: &mut [Lanes<T>],
+    mut out: Strip<'_, T>,
+) -> usize {
+    let mut saturated = 0;
+    let level = SimdLevel::detect();
+    let blocks = scene.blocks();
+    let total = scene.channels.total;
+    let mut task = scene.task(out.tile);
+    if task.ranks.is_empty() {
+        if scene.background.is_none() {
+            return 0;
+        }
+        planes[..total * blocks].fill(Lanes::ZERO);
+        out.transmittance.fill(Lanes::ONE);
+    } else {
+        let open = scene.open_pixels(out.tile);
+        while task.first < total {
+            let tile_image = TileImage {
+                colors: &mut planes[task.first * blocks..],
+                transmittance: &mut *out.transmittance,
+                end: &mut *out.end,
+                masks: &mut *out.masks,
+                // The same for every group of channels.
+                saturated: &mut saturated,
+            };
+            dispatch::forward(level, &task, &open, tile_image);
+            task.first += MAX_CHANNELS;
+        }
+    }
+    if scene.expected_depth {
+        out.depths
+            .copy_from_slice(&planes[(total - 1) * blocks..total * blocks]);
+    }
+    match total {
+        1 if !scene.expected_depth => write_colors::<T, 1>(scene, background, planes, &mut out),
+        3 if !scene.expected_depth => write_colors::<T, 3>(scene, background, planes, &mut out),
+        4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
+        _ => write_tile(scene, background, planes, &mut out),
+    }
+    saturated
+}
+
+/// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.
+fn write_tile<T: Real>(scene: &Scene<'_, T>, background: &[T], planes: &[Lanes<T>], out: &mut Strip<'_, T>) {
+    let total = scene.channels.total;
+    let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
+    for (y, (colors, alphas)) in out.colors.iter_mut().zip(&mut out.alphas).enumerate() {
+        for (x, (values, alpha)) in colors.chunks_exact_mut(total).zip(alphas.iter_mut()).enumerate() {
+            let block = y / BLOCK * side + x / BLOCK;
+            let lane = y % BLOCK * BLOCK + x % BLOCK;
+            let transmittance = out.transmittance[block].0[lane];
+            for (channel, value) in values.iter_mut().enumerate() {
+                *value = planes[channel * blocks + block].0[lane] + transmittance * background[channel];
+            }
+            *alpha = T::ONE - transmittance;
+            if scene.expected_depth {
+                values[total - 1] = values[total - 1] / alpha.greater(T::of(LEAST_ALPHA));
+            }
+        }
+    }
+}
+
+/// [`write_tile`] for the usual numbers of channels and no division, a row of a block at a time.
+fn write_colors<T: Real, const K: usize>(
+    scene: &Scene<'_, T>,
+    background: &[T],
+    planes: &[Lanes<T>],
+    out: &mut Strip<'_, T>,
+) {
+    let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
+    let background: [T; K] = std::array::from_fn(|k| background[k]);
+    for (y, (colors, alphas)) in out.colors.iter_mut().zip(&mut out.alphas).enumerate() {
+        let (first, row) = (y / BLOCK * side, y % BLOCK);
+        let colors = colors.as_chunks_mut::<K>().0;
+        let (whole_colors, last_colors) = colors.as_chunks_mut::<BLOCK>();
+        let (whole_alphas, last_alphas) = alphas.as_chunks_mut::<BLOCK>();
+        let last = first + whole_alphas.len();
+        let pixels = |block: usize| {
+            let transmittance = out.transmittance[block].rows()[row];
+            let values: [[T; BLOCK]; K] = std::array::from_fn(|k| planes[k * blocks + block].rows()[row]);
+            let mut colors = [[T::ZERO; K]; BLOCK];
+            let mut alphas = [T::ZERO; BLOCK];
+            for i in 0..BLOCK {
+                for k in 0..K {
+                    colors[i][k] = values[k][i] + transmittance[i] * background[k];
+                }
+                alphas[i] = T::ONE - transmittance[i];
+            }
+            (colors, alphas)
+        };
+        for (block, (colors, alphas)) in (first..).zip(whole_colors.iter_mut().zip(whole_alphas)) {
+            (*colors, *alphas) = pixels(block);
+        }
+        if !last_alphas.is_empty() {
+            let (colors, alphas) = pixels(last);
+            last_colors.copy_from_slice(&colors[..last_colors.len()]);
+            last_alphas.copy_from_slice(&alphas[..last_alphas.len()]);
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! One tile, back to front, gradients.
+
+use super::{
+    ABSOLUTES, AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane,
+    TileTask, WORD,
+};
+use crate::math::real::Real;
+use crate::simd::vector::{MAX_SUMS, Vector};
+
+/// What backward needs of a tile's pixels, in block order.
+pub(crate) struct TileCotangents<'a, T> {
+    pub(crate) transmittance: &'a [Lanes<T>],
+    pub(crate) end: &'a [Lanes<T>],
+    pub(crate) masks: &'a [u16],
+    /// Gradients of the channels handled now.
+    pub(crate) v_values: &'a [TilePlane<T>; MAX_CHANNELS],
+    /// Gradient of the final transmittance, from alpha and background.
+    pub(crate) v_transmittance: &'a TilePlane<T>,
+}
+
+/// A block of pixels while the light is followed back.
+#[derive(Clone, Copy)]
+struct Block<T, const K: usize> {
+    x: Lanes<T>,
+    y: Lanes<T>,
+    /// Transmittance behind the splat at hand.
+    transmittance: Lanes<T>,
+    /// What lies behind, per unit of light that reaches it: Σ weight · value · v, and the background's part.
+    behind: Lanes<T>,
+    end: Lanes<T>,
+    v_values: [Lanes<T>; K],
+}
+
+/// A splat's gradients, not yet summed over lanes.
+struct Sums<V, const K: usize> {
+    moments: [V; MOMENTS],
+    v_values: [V; K],
+    absolutes: [V; ABSOLUTES],
+}
+
+#[inline(always)]
+fn absolute<V: Vector>(x: V) -> V {
+    x.max(V::splat(V::Scalar::ZERO).minus(x))
+}
+
+/// The rules of a render in vectors.
+struct Rules<V> {
+    threshold: V,
+    max_alpha: V,
+    one: V,
+}
+
+impl<V: Vector, const K: usize> Sums<V, K> {
+    #[inline(always)]
+    fn add<const ABSOLUTE: bool, const DEGREE: usize>(
+        &mut self,
+        entry: &Entry<V::Scalar, K>,
+        block: &mut Block<V::Scalar, K>,
+        lane: usize,
+        rules: &Rules<V>,
+    ) {
+        let (u, v) = entry.whitened(block.x.get::<V>(lane), block.y.get(lane));
+        let raw = entry.raw_alpha::<V, DEGREE>(u, v);
+        let hit = V::both(
+            block.end.get::<V>(lane).at_least(V::splat(entry.place)),
+            raw.at_least(rules.threshold),
+        );
+        let alpha = raw.min(rules.max_alpha).keep(hit);
+        let before = block.transmittance.get::<V>(lane).over(rules.one.minus(alpha));
+        let weight = alpha.times(before);
+        // What this splat shows instead of what it hides.
+        let behind = block.behind.get::<V>(lane);
+        let mut change = V::splat(entry.values[0]).times_minus(block.v_values[0].get(lane), behind);
+        for k in 1..K {
+            change = V::splat(entry.values[k]).times_plus(block.v_values[k].get(lane), change);
+        }
+        let free = V::both(hit, rules.max_alpha.at_least(raw));
+        let h = before.times(change).times(raw).keep(free);
+        block.transmittance.set(lane, before);
+        block.behind.set(lane, alpha.times_plus(change, behind));
+        let (hu, hv) = (h.times(u), h.times(v));
+        let [m, mu, mv, muu, muv, mvv] = self.moments;
+        self.moments = [
+            m.plus(h),
+            mu.plus(hu),
+            mv.plus(hv),
+            hu.times_plus(u, muu),
+            hu.times_plus(v, muv),
+            hv.times_plus(v, mvv),
+        ];
+        for k in 0..K {
+            self.v_values[k] = weight.times_plus(block.v_values[k].get(lane), self.v_values[k]);
+        }
+        if ABSOLUTE {
+            let along_y = V::splat(entry.w12).times_plus(hu, V::splat(entry.w22).times(hv));
+            let [x, y] = self.absolutes;
+            self.absolutes = [x.plus(absolute(hu)), y.plus(absolute(along_y))];
+        }
+    }
+
+    /// The moments, then the gradients of the K channels, then the absolutes.
+    #[inline(always)]
+    fn reduced<const ABSOLUTE: bool>(&self) -> [V::Scalar; MAX_SUMS] {
+        let mut all = [V::splat(V::Scalar::ZERO); MAX_SUMS];
+        all[..MOMENTS].copy_from_slice(&self.moments);
+        all[MOMENTS..MOMENTS + K].copy_from_slice(&self.v_values);
+        if ABSOLUTE {
+            all[MOMENTS + K..][..ABSOLUTES].copy_from_slice(&self.absolutes);
+        }
+        V::sums(&all)
+    }
+}
+
+/// Writes what [`Sums::reduced`] yields into a slot. Channels after the first group add to the moments and the
+/// absolutes.
+#[inline(always)]
+fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
+    task: &TileTask<'_, T>,
+    slot: &mut [T],
+    sums: &[T; MAX_SUMS],
+) {
+    let total = task.channels.total;
+    if !ABSOLUTE && total == K && task.first == 0 {
+        // As the general case, with a length that the compiler knows: no calls to copy a few bytes.
+        slot[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
+        return;
+    }
+    let used = (total - task.first).min(K);
+    let mut put = |place: usize, value: T, anew: bool| {
+        slot[place] = if anew { value } else { slot[place] + value };
+    };
+    for k in 0..MOMENTS {
+        put(k, sums[k], task.first == 0);
+    }
+    for k in 0..used {
+        put(MOMENTS + task.first + k, sums[MOMENTS + k], true);
+    }
+    if ABSOLUTE {
+        for k in 0..ABSOLUTES {
+            put(MOMENTS + total + k, sums[MOMENTS + K + k], task.first == 0);
+        }
+    }
+}
+
+/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`size` values
+/// each: the moments, then all channels, then the absolutes if ABSOLUTE).
+#[inline(always)]
+pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, const DEGREE: usize>(
+    task: &TileTask<'_, V::Scalar>,
+    pixels: &TileCotangents<'_, V::Scalar>,
+    slots: &mut [V::Scalar],
+    size: usize,
+) {
+    let zero = V::Scalar::ZERO;
+    let blocks = task.side * task.side;
+    let centres = PixelCentres::new(task);
+    let mut state = [Block {
+        x: Lanes::ZERO,
+        y: Lanes::ZERO,
+        transmittance: Lanes::ONE,
+        behind: Lanes::ZERO,
+        end: Lanes::ZERO,
+        v_values: [Lanes::ZERO; K],
+    }; MAX_BLOCKS];
+    // Blocks with a gradient, and where their lists end: a block sleeps until the walk comes to its end.
+    let mut sleeping = 0u16;
+    let mut ends = [0u32; MAX_BLOCKS];
+    for (b, block) in state[..blocks].iter_mut().enumerate() {
+        block.x = centres.x[b];
+        block.y = centres.y[b];
+        block.transmittance = pixels.transmittance[b];
+        block.behind = pixels.v_transmittance[b];
+        block.end = pixels.end[b];
+        let mut any = false;
+        for i in 0..LANES {
+            any |= block.behind.0[i] != zero;
+        }
+        for k in 0..K {
+            block.v_values[k] = pixels.v_values[k][b];
+            for i in 0..LANES {
+                any |= block.v_values[k].0[i] != zero;
+            }
+        }
+        let end = block.end.0.iter().fold(zero, |end, &lane| end.greater(lane));
+        ends[b] = if any { end.past_ordinal() } else { 0 };
+        sleeping |= u16::from(ends[b] > 0) << b;
+    }
+    let mut active = 0u16;
+    let mut wake_at = ends.iter().copied().max().unwrap_or(0) as usize;
+    let rules = Rules {
+        threshold: V::splat(task.threshold()),
+        max_alpha: V::splat(task.limits.max_alpha),
+        one: V::splat(V::Scalar::ONE),
+    };
+
+    let mut entries = [Entry::<V::Scalar, K>::ZERO; WORD];
+    for batch in (0..task.ranks.len()).step_by(WORD).rev() {
+        let masks = &pixels.masks[batch..task.ranks.len().min(batch + WORD)];
+        for (i, mask) in masks.iter().enumerate() {
+            task.prefetch(batch + i + AHEAD);
+            if mask & (active | sleeping) != 0 {
+                entries[i] = Entry::load(task, batch + i);
+            }
+        }
+        for (i, mask) in masks.iter().enumerate().rev() {
+            if batch + i < wake_at {
+                wake_at = 0;
+                for b in 0..blocks {
+                    if sleeping >> b & 1 != 0 {
+                        if batch + i < ends[b] as usize {
+                            active |= 1 << b;
+                            sleeping &= !(1 << b);
+                        } else {
+                            wake_at = wake_at.max(ends[b] as usize);
+                        }
+                    }
+                }
+            }
+            let mut rest = mask & active;
+            let slot = &mut slots[(batch + i) * size..][..size];
+            if rest == 0 {
+                write::<V::Scalar, K, ABSOLUTE>(task, slot, &[zero; MAX_SUMS]);
+                continue;
+            }
+            let entry = &entries[i];
+            let mut sums = Sums::<V, K> {
+                moments: [V::splat(zero); MOMENTS],
+                v_values: [V::splat(zero); K],
+                absolutes: [V::splat(zero); ABSOLUTES],
+            };
+            while rest != 0 {
+                let block = rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                for lane in (0..LANES).step_by(V::LANES) {
+                    sums.add::<ABSOLUTE, DEGREE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
+                }
+            }
+            write::<V::Scalar, K, ABSOLUTE>(task, slot, &sums.reduced::<ABSOLUTE>());
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! The two inner loops: one tile forward, one tile backward.
+//!
+//! A tile is cut into blocks of 4×4 pixels, 16 lanes: one AVX-512 vector, two of AVX2, four of SSE2 or NEON. The loops are
+//! written once, over the trait [`Vector`], and `dispatch` compiles them once per instruction set.
+//!
+//! Forward walks block by block, so that transmittance and colour stay in registers while a block's own list goes by.
+//! Backward walks splat by splat, back to front, so that a splat's gradient is reduced once per tile, and recomputes
+//! alpha: cheaper than storing it.
+
+mod backward;
+mod forward;
+mod median;
+mod reach;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use backward::{TileCotangents, backward_tile};
+pub(crate) use forward::{TileImage, forward_tile};
+pub(crate) use median::median_tile;
+
+use crate::input::settings::Limits;
+use crate::math::real::Real;
+use crate::project::splat::Splat;
+use crate::simd::prefetch;
+use crate::simd::vector::Vector;
+
+/// Pixels in a block.
+pub(crate) const LANES: usize = 16;
+/// Pixels along a side of a block.
+pub(crate) const BLOCK: usize = 4;
+/// Most pixels along a side of a tile.
+pub(crate) const MAX_SIDE: usize = 16;
+/// Most blocks in a tile.
+pub(crate) const MAX_BLOCKS: usize = 16;
+/// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv, where h is the gradient of
+/// alpha times alpha.
+pub(crate) const MOMENTS: usize = 6;
+/// Gradient values after those of the channels where they are asked for: Σ |h u|, and Σ |h (w12 u + w22 v)|.
+pub(crate) const ABSOLUTES: usize = 2;
+/// Most channels composited at once.
+pub(crate) const MAX_CHANNELS: usize = 8;
+/// Splats whose block masks make a word per block.
+const WORD: usize = 64;
+/// Splats that are asked for ahead of the one being loaded.
+const AHEAD: usize = 12;
+
+/// One value per pixel of a block, where a vector register finds it: a load that straddles two cache lines is slow.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+pub(crate) struct Lanes<T>(pub(crate) [T; LANES]);
+
+impl<T: Real> Default for Lanes<T> {
+    fn default() -> Self {
+        Self::ZERO
+    }
+}
+
+impl<T: Real> Lanes<T> {
+    pub(crate) const ZERO: Self = Self([T::ZERO; LANES]);
+    pub(crate) const ONE: Self = Self([T::ONE; LANES]);
+
+    /// By row of the block.
+    #[inline(always)]
+    pub(crate) fn rows(&self) -> &[[T; BLOCK]] {
+        self.0.as_chunks().0
+    }
+
+    /// By row of the block.
+    #[inline(always)]
+    pub(crate) fn rows_mut(&mut self) -> &mut [[T; BLOCK]] {
+        self.0.as_chunks_mut().0
+    }
+
+    #[inline(always)]
+    fn get<V: Vector<Scalar = T>>(&self, first: usize) -> V {
+        V::load(&self.0[first..first + V::LANES])
+    }
+
+    #[inline(always)]
+    fn set<V: Vector<Scalar = T>>(&mut self, first: usize, values: V) {
+        values.store(&mut self.0[first..first + V::LANES]);
+    }
+}
+
+/// One value per pixel of a tile.
+pub(crate) type TilePlane<T> = [Lanes<T>; MAX_BLOCKS];
+
+/// Where the values of channels come from: the caller's colours, then camera z.
+#[derive(Clone, Copy)]
+pub(crate) struct Channels<'a, T> {
+    pub(crate) colors: &'a [T],
+    /// Values per Gaussian in `colors`.
+    pub(crate) stride: usize,
+    /// Channels composited: `stride`, 1 more for depth after colours, or 1 for depth alone.
+    pub(crate) total: usize,
+    /// Channels of `colors` that are composited: all or none.
+    pub(crate) colored: usize,
+}
+
+/// One tile's work: everything but the outputs.
+#[derive(Clone, Copy)]
+pub(crate) struct TileTask<'a, T> {
+    /// Top-left pixel.
+    pub(crate) origin: (usize, usize),
+    /// Blocks along a side.
+    pub(crate) side: usize,
+    /// The Gaussians of the tile's list, front to back.
+    pub(crate) ranks: &'a [u32],
+    /// By Gaussian.
+    pub(crate) splats: &'a [Splat<T>],
+    pub(crate) channels: Channels<'a, T>,
+    /// First of the channels handled now.
+    pub(crate) first: usize,
+    pub(crate) limits: &'a Limits<T>,
+}
+
+impl<T: Real> TileTask<'_, T> {
+    /// Where coordinates of the kernels have their zero: the middle of the 16×16 pixels around the tile. Small
+    /// coordinates round least, and an anchor that is the same for tiles of any size gives the same bits for each.
+    #[inline(always)]
+    fn anchor(&self) -> [T; 2] {
+        let middle = |first: usize| T::of((first - first % MAX_SIDE + MAX_SIDE / 2) as f64);
+        [middle(self.origin.0), middle(self.origin.1)]
+    }
+
+    /// The first pixel centre of the tile, from its anchor.
+    #[inline(always)]
+    fn first_centre(&self) -> [T; 2] {
+        let first = |first: usize| T::of((first % MAX_SIDE) as f64 + 0.5 - (MAX_SIDE / 2) as f64);
+        [first(self.origin.0), first(self.origin.1)]
+    }
+
+    /// Asks for the memory that a place of the list will be loaded from: Gaussians lie in no order of a tile's.
+    #[inline(always)]
+    fn prefetch(&self, index: usize) {
+        if let Some(&rank) = self.ranks.get(index) {
+            prefetch(self.splats, rank as usize);
+            prefetch(
+                self.channels.colors,
+                rank as usize * self.channels.stride + self.first,
+            );
+        }
+    }
+
+    /// Centre of a splat from the tile's anchor.
+    #[inline(always)]
+    fn centre(&self, splat: &Splat<T>) -> [T; 2] {
+        let [x, y] = self.anchor();
+        [splat.x - x, splat.y - y]
+    }
+
+    /// Alpha from which a pair counts; a limit of alpha below the threshold lets none count.
+    #[inline(always)]
+    fn threshold(&self) -> T {
+        if self.limits.max_alpha >= self.limits.alpha_threshold {
+            self.limits.alpha_threshold
+        } else {
+            T::of(f64::INFINITY)
+        }
+    }
+}
+
+/// A splat as a tile sees it: (u, v) = (w11 x + w12 y + u0, w22 y + v0) at (x, y) from the tile's anchor, and the
+/// values of K channels. One cache line in f32.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Entry<T, const K: usize> {
+    w11: T,
+    w12: T,
+    u0: T,
+    w22: T,
+    v0: T,
+    log_opacity: T,
+    /// Place in the list as a number that compares as the place does.
+    place: T,
+    values: [T; K],
+}
+
+impl<T: Real, const K: usize> Entry<T, K> {
+    const ZERO: Self = Self {
+        w11: T::ZERO,
+        w12: T::ZERO,
+        u0: T::ZERO,
+        w22: T::ZERO,
+        v0: T::ZERO,
+        log_opacity: T::ZERO,
+        place: T::ZERO,
+        values: [T::ZERO; K],
+    };
+
+    #[inline(always)]
+    fn load(task: &TileTask<'_, T>, index: usize) -> Self {
+        let rank = task.ranks[index] as usize;
+        let splat = &task.splats[rank];
+        let [x, y] = task.centre(splat);
+        let mut values = [T::ZERO; K];
+        let c = &task.channels;
+        let start = rank * c.stride + task.first;
+        if task.first + K <= c.colored {
+            values.copy_from_slice(&c.colors[start..start + K]);
+        } else {
+            for (k, value) in values.iter_mut().enumerate() {
+                if task.first + k < c.colored {
+                    *value = c.colors[start + k];
+                } else if task.first + k < c.total {
+                    *value = splat.depth;
+                }
+            }
+        }
+        Self {
+            w11: splat.w11,
+            w12: splat.w12,
+            u0: -(splat.w11 * x + splat.w12 * y),
+            w22: splat.w22,
+            v0: -(splat.w22 * y),
+            log_opacity: splat.log_opacity,
+            place: T::ordinal(index as u32),
+            values,
+        }
+    }
+
+    #[inline(always)]
+    fn whitened<V: Vector<Scalar = T>>(&self, x: V, y: V) -> (V, V) {
+        let u = V::splat(self.w12).times_plus(y, V::splat(self.u0));
+        (
+            V::splat(self.w11).times_plus(x, u),
+            V::splat(self.w22).times_plus(y, V::splat(self.v0)),
+        )
+    }
+
+    /// Alpha before it is limited: opacity · 2^−(u² + v²).
+    #[inline(always)]
+    fn raw_alpha<V: Vector<Scalar = T>, const DEGREE: usize>(&self, u: V, v: V) -> V {
+        let v2 = v.times_minus(v, V::splat(self.log_opacity));
+        u.minus_times_minus(u, v2).exp2::<DEGREE>()
+    }
+}
+
+/// Pixel centres of every block from the tile's anchor.
+struct PixelCentres<T> {
+    x: TilePlane<T>,
+    y: TilePlane<T>,
+}
+
+impl<T: Real> PixelCentres<T> {
+    #[inline(always)]
+    fn new(task: &TileTask<'_, T>) -> Self {
+        let ([x, y], side) = (task.first_centre(), task.side);
+        let offset = |at: usize, lane: usize| T::of((at * BLOCK + lane) as f64);
+        Self {
+            x: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| x + offset(b % side, i % BLOCK)))),
+            y: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| y + offset(b / side, i / BLOCK)))),
+        }
+    }
+}

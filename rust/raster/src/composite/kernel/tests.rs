@@ -1,0 +1,218 @@
+//! Every instruction set of this machine, and the portable vectors, against double precision: one tile both ways.
+
+use super::*;
+use crate::composite::dispatch;
+use crate::composite::slots::slot_size;
+use crate::input::settings::RasterSettings;
+use crate::simd::Vectors;
+use crate::simd::level::SimdLevel;
+use crate::simd::portable::Array;
+use crate::simd::vector::FINEST;
+
+const SPLATS: usize = 150;
+
+/// What to run the kernels with.
+#[derive(Clone, Copy, Debug)]
+enum Runner {
+    Level(SimdLevel),
+    Portable,
+}
+
+fn runners() -> Vec<Runner> {
+    let levels = SimdLevel::available().into_iter().map(Runner::Level);
+    levels.chain([Runner::Portable]).collect()
+}
+
+/// The portable vectors in each scalar.
+trait Portable: Vectors {
+    type Vector: Vector<Scalar = Self>;
+}
+impl Portable for f32 {
+    type Vector = Array<f32>;
+}
+impl Portable for f64 {
+    type Vector = Array<f64>;
+}
+
+#[derive(Debug)]
+struct Outcome {
+    image: Vec<f64>,
+    slots: Vec<f64>,
+}
+
+/// Composites 150 splats, half of them faint, into one tile of 4·side pixels and follows a gradient back.
+fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
+    run_with::<T>(runner, channels, side, &RasterSettings::default())
+}
+
+fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings: &RasterSettings) -> Outcome {
+    let mut state = 12345u64;
+    let mut uniform = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (state >> 40) as f64 / (1u64 << 24) as f64
+    };
+    let threshold = 1.0 / 255.0;
+    let splats: Vec<Splat<T>> = (0..SPLATS)
+        .map(|i| {
+            let opacity = if i % 2 == 0 { 0.06 } else { 1.02 * uniform() + 0.01 };
+            Splat {
+                x: T::of(64.0 + 20.0 * uniform() - 2.0),
+                y: T::of(32.0 + 20.0 * uniform() - 2.0),
+                w11: T::of(0.1 + 0.5 * uniform()),
+                w12: T::of(uniform() - 0.5),
+                w22: T::of(0.1 + 0.5 * uniform()),
+                log_opacity: T::of(opacity.log2()),
+                reach: T::of((opacity / threshold).log2()),
+                depth: T::of(1.0 + i as f64),
+            }
+        })
+        .collect();
+    let colors: Vec<T> = (0..SPLATS * channels).map(|_| T::of(uniform())).collect();
+    let all: Vec<u32> = (0..SPLATS as u32).collect();
+    let limits = Limits::new(settings).unwrap();
+    let mut task = TileTask {
+        origin: (64, 32),
+        side,
+        ranks: &all,
+        splats: &splats,
+        channels: Channels {
+            colors: &colors,
+            stride: channels,
+            total: channels,
+            colored: channels,
+        },
+        first: 0,
+        limits: &limits,
+    };
+    let blocks = side * side;
+    let mut open = [0xFFFF; MAX_BLOCKS];
+    open[0] = 0xFF0F;
+    let mut planes = vec![Lanes::ZERO; channels.next_multiple_of(MAX_CHANNELS) * blocks];
+    let mut transmittance = vec![Lanes::ZERO; blocks];
+    let mut end = vec![Lanes::ZERO; blocks];
+    let mut masks = vec![0; SPLATS];
+    let size = slot_size(channels, false);
+    // Slots are written, not added to.
+    let mut slots = vec![T::of(f64::NAN); SPLATS * size];
+    while task.first < channels {
+        let out = TileImage {
+            colors: &mut planes[task.first * blocks..],
+            transmittance: &mut transmittance,
+            end: &mut end,
+            masks: &mut masks,
+            saturated: &mut 0,
+        };
+        match runner {
+            Runner::Level(level) => dispatch::forward(level, &task, &open, out),
+            Runner::Portable => forward_tile::<T::Vector, MAX_CHANNELS, FINEST>(&task, &open, out),
+        }
+        let mut plane = |_| std::array::from_fn(|_| Lanes(std::array::from_fn(|_| T::of(uniform() - 0.5))));
+        let v_values = std::array::from_fn(&mut plane);
+        let v_transmittance = if task.first == 0 {
+            plane(0)
+        } else {
+            [Lanes::ZERO; MAX_BLOCKS]
+        };
+        let cotangents = TileCotangents {
+            transmittance: &transmittance,
+            end: &end,
+            masks: &masks,
+            v_values: &v_values,
+            v_transmittance: &v_transmittance,
+        };
+        match runner {
+            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, size, false),
+            Runner::Portable => {
+                backward_tile::<T::Vector, MAX_CHANNELS, false, FINEST>(&task, &cotangents, &mut slots, size);
+            }
+        }
+        task.first += MAX_CHANNELS;
+    }
+    let image = planes[..channels * blocks]
+        .iter()
+        .chain(&transmittance)
+        .flat_map(|lanes| &lanes.0);
+    Outcome {
+        image: image.map(|v| v.as_f64()).collect(),
+        slots: slots.iter().map(|v| v.as_f64()).collect(),
+    }
+}
+
+fn relative(a: &[f64], b: &[f64]) -> f64 {
+    let difference: f64 = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum();
+    (difference / b.iter().map(|b| b * b).sum::<f64>()).sqrt()
+}
+
+#[test]
+fn every_instruction_set_agrees_with_double_precision() {
+    for channels in 1..=8 {
+        for side in [1, 2, 4] {
+            let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), channels, side);
+            for runner in runners() {
+                if matches!(runner, Runner::Portable) && channels < MAX_CHANNELS {
+                    continue;
+                }
+                let (single, double) = (
+                    run::<f32>(runner, channels, side),
+                    run::<f64>(runner, channels, side),
+                );
+                let errors = [
+                    (relative(&single.image, &exact.image), 1e-6),
+                    (relative(&single.slots, &exact.slots), 5e-6),
+                    (relative(&double.image, &exact.image), 1e-14),
+                    (relative(&double.slots, &exact.slots), 1e-13),
+                ];
+                assert!(
+                    errors.iter().all(|(error, limit)| error < limit),
+                    "{runner:?}, {channels} channels, side {side}: {errors:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn channels_beyond_a_group_add_to_the_moments() {
+    for runner in runners() {
+        if matches!(runner, Runner::Portable) {
+            continue;
+        }
+        let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), 11, 4);
+        let single = run::<f32>(runner, 11, 4);
+        assert!(relative(&single.image, &exact.image) < 1e-6);
+        assert!(relative(&single.slots, &exact.slots) < 5e-6, "{runner:?}");
+    }
+}
+
+#[test]
+fn rough_exponentials_are_as_rough_as_their_degree() {
+    for level in SimdLevel::available() {
+        for channels in [1, 3, 5] {
+            let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), channels, 4);
+            let errors = [3, 4, 5].map(|exp_degree| {
+                let settings = RasterSettings {
+                    exp_degree,
+                    ..RasterSettings::default()
+                };
+                let rough = run_with::<f32>(Runner::Level(level), channels, 4, &settings);
+                [
+                    relative(&rough.image, &exact.image),
+                    relative(&rough.slots, &exact.slots),
+                ]
+            });
+            for (error, limits) in errors.as_flattened().iter().zip([
+                1e-5..2e-4,
+                1e-5..1e-3,
+                3e-7..6e-6,
+                3e-7..3e-5,
+                0.0..1e-6,
+                0.0..5e-6,
+            ]) {
+                assert!(
+                    limits.contains(error),
+                    "{level:?}, {channels} channels: {errors:?}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! What a render is made from, checked.
+
+pub(crate) mod camera;
+pub(crate) mod gaussians;
+pub(crate) mod settings;

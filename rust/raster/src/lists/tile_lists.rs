@@ -1,0 +1,172 @@
+//! Which splats a tile shows, front to back.
+
+use crate::error::RasterError;
+use crate::lists::radix_sort::{SortScratch, radix_sort_with};
+use crate::math::real::Real;
+use crate::memory::pool::{Buffers, bytes_of, filled, stale};
+use crate::memory::shared_slice::Shared;
+use crate::project::packet::CHUNK;
+use crate::project::projected::Projected;
+use crate::project::splat::Splat;
+use crate::project::tiles::Cover;
+
+/// For every tile the splats that may reach it, front to back.
+#[derive(Debug, Default)]
+pub(crate) struct TileLists {
+    /// Tile t owns `ranks[offsets[t]..offsets[t + 1]]`.
+    pub(crate) offsets: Vec<u32>,
+    /// Indices of Gaussians.
+    pub(crate) ranks: Vec<u32>,
+    /// Gaussian by Gaussian and tile by tile: where in `ranks` it stands.
+    pub(crate) positions: Vec<u32>,
+}
+
+impl Buffers for TileLists {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.offsets) + bytes_of(&self.ranks) + bytes_of(&self.positions)
+    }
+}
+
+/// What sorting and binning need besides their results.
+#[derive(Debug)]
+pub(crate) struct ListScratch<T: Real> {
+    order: Vec<(T::Key, u32)>,
+    sort: SortScratch<T::Key>,
+    /// Per tile, where in its list the next splat from the front goes, and one past where the next from the back goes.
+    fronts: Vec<u32>,
+    backs: Vec<u32>,
+}
+
+impl<T: Real> Default for ListScratch<T> {
+    fn default() -> Self {
+        Self {
+            order: Vec::new(),
+            sort: SortScratch::default(),
+            fronts: Vec::new(),
+            backs: Vec::new(),
+        }
+    }
+}
+
+impl<T: Real> Buffers for ListScratch<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.order) + self.sort.bytes() + bytes_of(&self.fronts) + bytes_of(&self.backs)
+    }
+}
+
+/// Puts the Gaussians that reach some tile in order of depth, ties by index.
+fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut ListScratch<T>) {
+    scratch.order.clear();
+    for (chunk, (splats, cover)) in splats.chunks(CHUNK).zip(covers).enumerate() {
+        let first = (chunk * CHUNK) as u32;
+        let reached = splats
+            .iter()
+            .enumerate()
+            .filter(|&(local, _)| cover.reaches(local));
+        scratch
+            .order
+            .extend(reached.map(|(local, splat)| (splat.depth.key(), first + local as u32)));
+    }
+    radix_sort_with(&mut scratch.order, &mut scratch.sort);
+}
+
+/// Numbers the pairs of every chunk.
+fn number_pairs(covers: &mut [Cover]) -> Result<(), RasterError> {
+    let mut total = 0u32;
+    for cover in covers.iter_mut() {
+        cover.number(total);
+        total = u32::try_from(cover.count())
+            .ok()
+            .and_then(|pairs| total.checked_add(pairs))
+            .ok_or(RasterError::TooManyIntersections)?;
+    }
+    Ok(())
+}
+
+/// Counts the pairs of every tile.
+fn count_pairs(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
+    let offsets = filled(offsets, tiles + 1, 0);
+    for &tile in covers.iter().flat_map(Cover::pairs) {
+        offsets[tile as usize + 1] += 1;
+    }
+    let mut sum = 0;
+    for offset in offsets {
+        sum += *offset;
+        *offset = sum;
+    }
+}
+
+/// Sorts the projected splats by depth and lists those of every tile.
+pub(crate) fn bin_tiles<T: Real>(
+    projected: &mut Projected<T>,
+    tiles: usize,
+    scratch: &mut ListScratch<T>,
+    bins: &mut TileLists,
+) -> Result<(), RasterError> {
+    number_pairs(projected.covers_mut())?;
+    let (splats, covers) = (&projected.splats[..], projected.covers());
+    rayon::join(
+        || sort_by_depth(splats, covers, scratch),
+        || count_pairs(covers, tiles, &mut bins.offsets),
+    );
+    fill_bins(covers, scratch, bins);
+    Ok(())
+}
+
+/// The lists of all tiles while they are made.
+struct Lists<'a> {
+    covers: &'a [Cover],
+    ranks: Shared<'a>,
+    positions: Shared<'a>,
+}
+
+impl Lists<'_> {
+    /// Puts a Gaussian into the list of each tile that it reaches, where `place` says.
+    #[inline(always)]
+    fn put(&self, i: u32, mut place: impl FnMut(u32) -> u32) {
+        let (cover, local) = (&self.covers[i as usize / CHUNK], i as usize % CHUNK);
+        for (own, &tile) in cover.pairs_of(local).zip(cover.tiles_of(local)) {
+            let at = place(tile);
+            self.ranks.set(at as usize, i);
+            self.positions.set(own, at);
+        }
+    }
+}
+
+/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_pairs`]: the near half from the front of each
+/// list, at the same time the far half from its back.
+fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, bins: &mut TileLists) {
+    let ListScratch {
+        order, fronts, backs, ..
+    } = scratch;
+    let pairs = bins.offsets.last().map_or(0, |&end| end as usize);
+    let lists = Lists {
+        covers,
+        ranks: Shared::new(stale(&mut bins.ranks, pairs)),
+        positions: Shared::new(stale(&mut bins.positions, pairs)),
+    };
+    fronts.clone_from(&bins.offsets);
+    backs.clear();
+    backs.extend_from_slice(&bins.offsets[1..]);
+    let (near, far) = order.split_at(order.len() / 2);
+    rayon::join(
+        || {
+            for &(_, i) in near {
+                lists.put(i, |tile| {
+                    let next = &mut fronts[tile as usize];
+                    *next += 1;
+                    *next - 1
+                });
+            }
+        },
+        || {
+            for &(_, i) in far.iter().rev() {
+                lists.put(i, |tile| {
+                    let last = &mut backs[tile as usize];
+                    *last -= 1;
+                    *last
+                });
+            }
+        },
+    );
+}

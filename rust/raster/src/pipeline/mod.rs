@@ -1,0 +1,4 @@
+//! The stages in order, for one view.
+
+pub(crate) mod scalar;
+pub(crate) mod view;

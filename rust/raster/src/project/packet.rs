@@ -1,0 +1,303 @@
+//! Projection and its vjp for many Gaussians at once.
+//!
+//! A chunk is transposed into columns, one per number, so that the loops over its Gaussians vectorise; `levels`
+//! compiles them once per CPU feature level. Chunks are the unit of parallel work. Their size is fixed, so that sums over
+//! chunks do not depend on the number of threads.
+
+use crate::input::gaussians::Gaussians;
+use crate::math::real::Real;
+use crate::project::splat::{Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
+use crate::project::tiles::{Cover, Cutter, Ellipse, TileGrid, padded_reach, pixel_range};
+
+/// Gaussians in a chunk.
+pub(crate) const CHUNK: usize = 256;
+/// Loops run over whole vectors; what is left over in a column is ignored.
+const LANES: usize = 16;
+
+/// Radii up to this many pixels are rounded in columns.
+const MOST_EXACT: f64 = 4e6;
+
+type Column<U> = [U; CHUNK];
+
+/// The Gaussians of a chunk: mean, quaternion, scale, opacity.
+struct Columns<T>([Column<T>; 11]);
+
+impl<T: Real> Columns<T> {
+    fn new() -> Self {
+        Self([[T::ZERO; CHUNK]; 11])
+    }
+
+    #[inline(always)]
+    fn set(&mut self, lane: usize, gaussians: &Gaussians<'_, T>, i: usize) {
+        let (mean, quat, scale) = (gaussians.means[i], gaussians.quats[i], gaussians.scales[i]);
+        let columns = &mut self.0;
+        [columns[0][lane], columns[1][lane], columns[2][lane]] = mean;
+        [
+            columns[3][lane],
+            columns[4][lane],
+            columns[5][lane],
+            columns[6][lane],
+        ] = quat;
+        [columns[7][lane], columns[8][lane], columns[9][lane]] = scale;
+        columns[10][lane] = gaussians.opacities[i];
+    }
+
+    #[inline(always)]
+    fn get(&self, lane: usize) -> ([T; 3], [T; 4], [T; 3], T) {
+        let c = &self.0;
+        (
+            [c[0][lane], c[1][lane], c[2][lane]],
+            [c[3][lane], c[4][lane], c[5][lane], c[6][lane]],
+            [c[7][lane], c[8][lane], c[9][lane]],
+            c[10][lane],
+        )
+    }
+}
+
+/// Lanes to run for so many Gaussians.
+#[inline(always)]
+fn whole_vectors(len: usize) -> usize {
+    len.next_multiple_of(LANES).min(CHUNK)
+}
+
+/// Where the splats of a chunk go.
+pub(crate) struct ChunkSplats<'a, T> {
+    /// By Gaussian; anything for one that no pixel sees.
+    pub(crate) splats: &'a mut [Splat<T>],
+    pub(crate) screen: ScreenInfo<'a, T>,
+    pub(crate) cover: &'a mut Cover,
+}
+
+/// Projects the Gaussians from `first` on and finds the tiles that each reaches.
+#[inline(always)]
+pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    grid: &TileGrid,
+    wanted: Option<&[bool]>,
+    out: ChunkSplats<'_, T>,
+) {
+    let len = out.splats.len();
+    let lens = *lens;
+    let mut columns = Columns::new();
+    for lane in 0..len.min(CHUNK) {
+        columns.set(lane, gaussians, first + lane);
+    }
+    let zero = [T::ZERO; CHUNK];
+    let [mut xs, mut ys, mut depths, mut log_opacities, mut reaches] = [zero; 5];
+    let [mut w11s, mut w12s, mut w22s, mut rxs, mut rys] = [zero; 5];
+    let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
+    let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; CHUNK]; 5];
+    let (height, most) = (T::of(grid.height as f64), T::of(MOST_EXACT));
+    // Tile sizes are powers of two; a division would cost more than all the rest.
+    let shift = grid.tile_size.trailing_zeros();
+    for lane in 0..whole_vectors(len) {
+        let (mean, quat, scale, opacity) = columns.get(lane);
+        let o = splat::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity);
+        let s = &o.splat;
+        (xs[lane], ys[lane], depths[lane]) = (s.x, s.y, s.depth);
+        (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
+        (log_opacities[lane], reaches[lane]) = (s.log_opacity, s.reach);
+        [rxs[lane], rys[lane]] = o.radii;
+        ceil_xs[lane] = o.radii[0].lesser(most).ceiling();
+        ceil_ys[lane] = o.radii[1].lesser(most).ceiling();
+        seen[lane] = u32::from(o.visible);
+
+        let reach = padded_reach(s.reach);
+        let extent = extent(reach);
+        let (half_width, half_height) = (extent * o.deviations[0], extent * o.deviations[1]);
+        padded[lane] = reach;
+        inverses[lane] = T::ONE / s.w11;
+        slopes[lane] = o.slope;
+        rights[lane] = o.tilt * half_width;
+        half_heights[lane] = half_height;
+        let (top, past) = pixel_range(s.y - half_height, s.y + half_height, height);
+        let any = o.visible & (top < past);
+        tops[lane] = top >> shift;
+        bottoms[lane] = if any {
+            (past.wrapping_sub(1) >> shift) + 1
+        } else {
+            0
+        };
+    }
+
+    let ScreenInfo {
+        means2d,
+        depths: camera_zs,
+        radii,
+    } = out.screen;
+    out.cover.clear(len);
+    out.cover.visible = 0;
+    let mut cutter = Cutter::new(grid, wanted);
+    for lane in 0..len.min(CHUNK) {
+        if seen[lane] == 0 {
+            (means2d[lane], camera_zs[lane], radii[lane]) = ([T::ZERO; 2], T::ZERO, [0; 2]);
+            continue;
+        }
+        out.cover.visible += 1;
+        let (x, y, depth) = (xs[lane], ys[lane], depths[lane]);
+        out.splats[lane] = Splat {
+            x,
+            y,
+            w11: w11s[lane],
+            w12: w12s[lane],
+            w22: w22s[lane],
+            log_opacity: log_opacities[lane],
+            reach: reaches[lane],
+            depth,
+        };
+        means2d[lane] = [x, y];
+        camera_zs[lane] = depth;
+        radii[lane] = [ceil_xs[lane] as i32, ceil_ys[lane] as i32];
+        if rxs[lane].greater(rys[lane]) >= most {
+            // The cast saturates, so an unbounded Gaussian gets the largest integer.
+            radii[lane] = [rxs[lane], rys[lane]].map(|r| r.as_f64().ceil() as i32);
+        }
+        let ellipse = Ellipse {
+            x,
+            y,
+            reach: padded[lane],
+            w22: w22s[lane],
+            inverse_w11: inverses[lane],
+            slope: slopes[lane],
+            right: rights[lane],
+            half_height: half_heights[lane],
+        };
+        cutter.push(lane, &ellipse, tops[lane]..bottoms[lane], out.cover);
+    }
+    cutter.flush(out.cover);
+    out.cover.finish();
+}
+
+/// Gradients of the splats of a chunk, packed: lane by lane those of the Gaussians that have any.
+pub(crate) struct ChunkGradients<T> {
+    /// Which Gaussian of the chunk is in each lane.
+    locals: Column<u32>,
+    /// How many.
+    pub(crate) len: usize,
+    /// h; hu, hv; huu, huv, hvv; camera z.
+    moments: [Column<T>; 7],
+    /// Of the Gaussians: mean, quaternion, scale, opacity; filled by [`vjp_chunk`].
+    gaussians: [Column<T>; 11],
+    /// Of the camera, summed over the chunk, if asked for.
+    pub(crate) viewmat: [[T; 4]; 3],
+}
+
+impl<T: Real> ChunkGradients<T> {
+    pub(crate) fn new() -> Self {
+        Self {
+            locals: [0; CHUNK],
+            len: 0,
+            moments: [[T::ZERO; CHUNK]; 7],
+            gaussians: [[T::ZERO; CHUNK]; 11],
+            viewmat: [[T::ZERO; 4]; 3],
+        }
+    }
+
+    /// Adds a Gaussian of the chunk with the gradients of its splat, unless all are zero.
+    #[inline(always)]
+    pub(crate) fn push(&mut self, local: usize, moments: [T; 7]) {
+        if moments == [T::ZERO; 7] {
+            return;
+        }
+        let lane = self.len;
+        self.locals[lane] = local as u32;
+        for (column, moment) in self.moments.iter_mut().zip(moments) {
+            column[lane] = moment;
+        }
+        self.len += 1;
+    }
+
+    /// Adds the gradients of the Gaussians to those of the chunk; an empty slice is one that nobody asked for.
+    #[inline(always)]
+    pub(crate) fn add_to(
+        &self,
+        means: &mut [[T; 3]],
+        quats: &mut [[T; 4]],
+        scales: &mut [[T; 3]],
+        opacities: &mut [T],
+    ) {
+        let locals = &self.locals[..self.len.min(CHUNK)];
+        let [m0, m1, m2, q0, q1, q2, q3, s0, s1, s2, o] = &self.gaussians;
+        add(locals, [m0, m1, m2], means);
+        add(locals, [q0, q1, q2, q3], quats);
+        add(locals, [s0, s1, s2], scales);
+        add(locals, [o], opacities.as_chunks_mut().0);
+    }
+}
+
+#[inline(always)]
+fn add<T: Real, const N: usize>(locals: &[u32], columns: [&Column<T>; N], sums: &mut [[T; N]]) {
+    if sums.is_empty() {
+        return;
+    }
+    for (lane, &local) in locals.iter().enumerate() {
+        let sum = &mut sums[local as usize];
+        for k in 0..N {
+            sum[k] += columns[k][lane];
+        }
+    }
+}
+
+/// Whether all are finite: NaN and infinity survive a multiplication by 0.
+#[inline(always)]
+pub(crate) fn is_sound<T: Real, const N: usize>(values: [T; N]) -> bool {
+    let mut sum = T::ZERO;
+    for value in values {
+        sum += value * T::ZERO;
+    }
+    sum == T::ZERO
+}
+
+/// The vjp of [`project_chunk`], from splats to Gaussians and camera. A Gaussian whose gradient is beyond the scalar's
+/// range has none, and gives the camera none: one that stands on the camera must not spoil the camera's gradient, nor
+/// an optimiser's averages.
+#[inline(always)]
+pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
+    gaussians: &Gaussians<'_, T>,
+    first: usize,
+    lens: &Lens<T>,
+    chunk: &mut ChunkGradients<T>,
+) {
+    let lens = *lens;
+    let len = chunk.len.min(CHUNK);
+    let mut columns = Columns::new();
+    for lane in 0..len {
+        columns.set(lane, gaussians, first + chunk.locals[lane] as usize);
+    }
+    let mut viewmats = [[T::ZERO; CHUNK]; 12];
+    let (moments, out) = (&chunk.moments, &mut chunk.gaussians);
+    for lane in 0..whole_vectors(len) {
+        let (mean, quat, scale, opacity) = columns.get(lane);
+        let m = |k: usize| moments[k][lane];
+        let [h, hu, hv, huu, huv, hvv, depth] = [m(0), m(1), m(2), m(3), m(4), m(5), m(6)];
+        let v = SplatGradient {
+            h,
+            first: [hu, hv],
+            second: [huu, huv, hvv],
+            depth,
+        };
+        let v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
+        // NaN that came in stays, so that it is noticed.
+        let poisoned = !is_sound([h, hu, hv, huu, huv, hvv, depth]);
+        let ([m0, m1, m2], [q0, q1, q2, q3], [s0, s1, s2]) = (v.mean, v.quat, v.scale);
+        let own = [m0, m1, m2, q0, q1, q2, q3, s0, s1, s2, v.opacity];
+        let kept = is_sound(own) | poisoned;
+        for k in 0..11 {
+            out[k][lane] = if kept { own[k] } else { T::ZERO };
+        }
+        if CAMERA {
+            let [v0, v1, v2] = v.viewmat;
+            let kept = kept & (is_sound(v0) & is_sound(v1) & is_sound(v2) | poisoned);
+            for k in 0..12 {
+                viewmats[k][lane] = if kept { v.viewmat[k / 4][k % 4] } else { T::ZERO };
+            }
+        }
+    }
+    if CAMERA {
+        for (sum, column) in chunk.viewmat.as_flattened_mut().iter_mut().zip(&viewmats) {
+            *sum = column[..len].iter().copied().sum();
+        }
+    }
+}

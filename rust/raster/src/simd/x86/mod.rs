@@ -1,0 +1,212 @@
+//! SSE2, AVX2 with FMA, and AVX-512.
+#![allow(unsafe_code)]
+
+use std::arch::x86_64::*;
+
+use crate::simd::vector::Vector;
+
+/// Calls an intrinsic that touches no memory.
+macro_rules! op {
+    ($e:expr) => {
+        // SAFETY: the types of this file are only used inside functions compiled for their instructions, which
+        // `dispatch` calls after detecting them.
+        unsafe { $e }
+    };
+}
+
+/// Methods that are one intrinsic for every x86 vector.
+macro_rules! common {
+    ($T:ty, $lanes:literal, $set1:ident, $loadu:ident, $storeu:ident, $add:ident, $sub:ident, $mul:ident, $min:ident, $max:ident) => {
+        type Scalar = $T;
+        const LANES: usize = $lanes;
+        #[inline(always)]
+        fn splat(value: $T) -> Self {
+            Self(op!($set1(value)))
+        }
+        #[inline(always)]
+        fn load(values: &[$T]) -> Self {
+            let values = &values[..$lanes];
+            // SAFETY: the slice holds LANES values, and the load may be unaligned.
+            Self(unsafe { $loadu(values.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, values: &mut [$T]) {
+            let values = &mut values[..$lanes];
+            // SAFETY: the slice holds LANES values, and the store may be unaligned.
+            unsafe { $storeu(values.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn plus(self, other: Self) -> Self {
+            Self(op!($add(self.0, other.0)))
+        }
+        #[inline(always)]
+        fn minus(self, other: Self) -> Self {
+            Self(op!($sub(self.0, other.0)))
+        }
+        #[inline(always)]
+        fn times(self, other: Self) -> Self {
+            Self(op!($mul(self.0, other.0)))
+        }
+        #[inline(always)]
+        fn min(self, other: Self) -> Self {
+            Self(op!($min(self.0, other.0)))
+        }
+        #[inline(always)]
+        fn max(self, other: Self) -> Self {
+            Self(op!($max(self.0, other.0)))
+        }
+    };
+}
+
+macro_rules! divided {
+    ($div:ident) => {
+        #[inline(always)]
+        fn over(self, other: Self) -> Self {
+            Self(op!($div(self.0, other.0)))
+        }
+    };
+}
+
+macro_rules! fused {
+    ($fmadd:ident, $fmsub:ident, $fnmadd:ident, $fnmsub:ident) => {
+        #[inline(always)]
+        fn times_plus(self, a: Self, b: Self) -> Self {
+            Self(op!($fmadd(self.0, a.0, b.0)))
+        }
+        #[inline(always)]
+        fn times_minus(self, a: Self, b: Self) -> Self {
+            Self(op!($fmsub(self.0, a.0, b.0)))
+        }
+        #[inline(always)]
+        fn times_from(self, a: Self, b: Self) -> Self {
+            Self(op!($fnmadd(self.0, a.0, b.0)))
+        }
+        #[inline(always)]
+        fn minus_times_minus(self, a: Self, b: Self) -> Self {
+            Self(op!($fnmsub(self.0, a.0, b.0)))
+        }
+    };
+}
+
+/// Two roundings: before FMA there is nothing else.
+macro_rules! separate {
+    () => {
+        #[inline(always)]
+        fn times_plus(self, a: Self, b: Self) -> Self {
+            self.times(a).plus(b)
+        }
+        #[inline(always)]
+        fn times_minus(self, a: Self, b: Self) -> Self {
+            self.times(a).minus(b)
+        }
+        #[inline(always)]
+        fn times_from(self, a: Self, b: Self) -> Self {
+            b.minus(self.times(a))
+        }
+        #[inline(always)]
+        fn minus_times_minus(self, a: Self, b: Self) -> Self {
+            Self::splat(0.0).minus(self.times(a).plus(b))
+        }
+    };
+}
+
+/// 2^x by rounding to the nearest integer, which adding 1.5 · 2^mantissa does and leaves in the low bits.
+macro_rules! exp2_by_bits {
+    ($coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident, $from_int:ident, $shift:ident, $add:ident) => {
+        #[inline(always)]
+        fn exp2<const DEGREE: usize>(self) -> Self {
+            let magic = Self::splat($magic);
+            let clipped = self.max(Self::splat($lowest));
+            let shifted = clipped.plus(magic);
+            let fraction = clipped.minus(shifted.minus(magic));
+            let power = polynomial(fraction, $coefficients);
+            Self(op!($from_int($add(
+                $to_int(power.0),
+                $shift::<$mantissa>($to_int(shifted.0))
+            ))))
+        }
+    };
+}
+
+/// The vector with this number, or zero.
+#[inline(always)]
+fn nth<V: Vector<Scalar = f32>, const N: usize>(vectors: &[V; N], i: usize) -> V {
+    if i < N { vectors[i] } else { V::splat(0.0) }
+}
+
+/// Four sums at once, each 128-bit part by itself: yields (a, b, c, d) in every part.
+macro_rules! fold4 {
+    ($v:expr, $first:expr, $lo:ident, $hi:ident, $lo2:ident, $hi2:ident, $add:ident, $cast:ident, $back:ident) => {{
+        let (a, b) = (nth($v, $first).0, nth($v, $first + 1).0);
+        let (c, d) = (nth($v, $first + 2).0, nth($v, $first + 3).0);
+        op!({
+            let ab = $add($lo(a, b), $hi(a, b));
+            let cd = $add($lo(c, d), $hi(c, d));
+            let (ab, cd) = ($cast(ab), $cast(cd));
+            $add($back($lo2(ab, cd)), $back($hi2(ab, cd)))
+        })
+    }};
+}
+
+/// Sums lane by lane, for vectors whose speed matters less.
+macro_rules! plain_sums {
+    ($T:ty, $lanes:literal) => {
+        #[inline(always)]
+        fn sums<const N: usize>(vectors: &[Self; N]) -> [$T; MAX_SUMS] {
+            let mut sums = [0.0; MAX_SUMS];
+            for (sum, vector) in sums.iter_mut().zip(vectors) {
+                let mut lanes = [0.0; $lanes];
+                vector.store(&mut lanes);
+                let mut width = $lanes;
+                while width > 1 {
+                    width /= 2;
+                    for i in 0..width {
+                        lanes[i] += lanes[i + width];
+                    }
+                }
+                *sum = lanes[0];
+            }
+            sums
+        }
+    };
+}
+
+// After the macros that they are written in.
+mod avx2;
+mod avx512;
+mod sse;
+
+pub(super) use avx2::{F32x8, F64x4};
+pub(super) use avx512::{F32x16, F64x8};
+pub(super) use sse::{F32x4, F64x2};
+
+#[inline(always)]
+pub(in crate::simd) fn prefetch<U>(value: &U) {
+    op!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()));
+}
+
+/// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word: 16 masks at a time, their bytes apart, a bit per step.
+#[inline(always)]
+pub(in crate::simd) fn transpose_bits(masks: &[u16; 64]) -> [u64; 16] {
+    let mut words = [0u64; 16];
+    for (quarter, masks) in masks.chunks_exact(16).enumerate() {
+        // SAFETY: SSE2 is part of x86-64; both loads are of 8 of the chunk's 16 masks and may be unaligned.
+        unsafe {
+            let a = _mm_loadu_si128(masks.as_ptr().cast());
+            let b = _mm_loadu_si128(masks.as_ptr().add(8).cast());
+            let low = _mm_set1_epi16(0xFF);
+            let mut bytes = [
+                _mm_packus_epi16(_mm_and_si128(a, low), _mm_and_si128(b, low)),
+                _mm_packus_epi16(_mm_srli_epi16::<8>(a), _mm_srli_epi16::<8>(b)),
+            ];
+            for (half, bytes) in bytes.iter_mut().enumerate() {
+                for bit in (0..8).rev() {
+                    let sixteen = _mm_movemask_epi8(*bytes) as u64;
+                    words[half * 8 + bit] |= sixteen << (quarter * 16);
+                    *bytes = _mm_add_epi8(*bytes, *bytes);
+                }
+            }
+        }
+    }
+    words
+}
