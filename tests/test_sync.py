@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bigs
 from bigs.cli import main, runs, terminal
+from bigs.commands import views
 from bigs.commands.formats import FORMATS
 from bigs.train.presets import PRESETS
 
@@ -22,6 +23,11 @@ def test_the_command_line_knows_every_preset() -> None:
 
 def test_the_command_line_knows_every_format() -> None:
     assert typing.get_args(runs.Format) == FORMATS
+
+
+def test_the_command_line_knows_how_to_render() -> None:
+    for name in ("World", "About", "DepthFormat"):
+        assert typing.get_args(getattr(runs, name)) == typing.get_args(getattr(views, name))
 
 
 def test_one_version() -> None:

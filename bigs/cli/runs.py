@@ -26,6 +26,9 @@ from bigs.cli.terminal import (
 if TYPE_CHECKING:
     from bigs.commands.reconstruct import Outcome
 
+# An option that is there or not, without a "--no-" of its own.
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
 # "auto", or the names of `train.config.PriorKind`; a test compares.
 Prior = Literal["auto", "off", "symmetry", "trained", "sd"]
 
@@ -44,6 +47,12 @@ Format = Literal[
     "arctic",
     "challenge",
 ]
+
+
+# Likewise of `commands.views`.
+World = Literal["camera", "object"]
+About = Literal["object", "scene"]
+DepthFormat = Literal["png", "npy"]
 
 
 def doctor() -> None:
@@ -165,20 +174,60 @@ def reconstruct(
     show(outcome)
 
 
-def render(run: RunPath, cameras: Path, out: Path, threads: int = 0) -> None:
-    """Render a finished run from the cameras of a transforms.json, as RGBA pictures with straight colour.
+def render(
+    run: RunPath,
+    cameras: Path | None = None,
+    out: Path | None = None,
+    orbit: Flag = False,
+    from_input: Flag = False,
+    frame: int | None = None,
+    play: Flag = False,
+    about: About | None = None,
+    pictures: int | None = None,
+    size: tuple[int, int] | None = None,
+    world: World | None = None,
+    video: Path | None = None,
+    depth: DepthFormat | None = None,
+    background: str = "transparent",
+    threads: int = 0,
+) -> None:
+    """Render a finished run from a file's cameras, in a turn, or as its clip was filmed; pictures or video.
 
     Args:
         run: the run folder.
-        cameras: transforms.json (OpenGL camera-to-world; each frame names its frame_index).
-        out: folder for 0000.png, 0001.png, ... in the file's order.
+        cameras: a transforms.json of instant-ngp, nerfstudio or Blender, or a camera path that nerfstudio's
+            viewer saved (OpenGL camera-to-world). A frame_index in it says which time a camera shows; without
+            one --frame or --play does.
+        out: folder for 0000.png, 0001.png, ...: RGBA with straight colour, or RGB before a background.
+        orbit: a turn around the image's vertical, at one time or while the clip plays.
+        from_input: the clip's own camera, every frame or the one that --frame names.
+        frame: the time to show; an orbit without it shows the clip's middle.
+        play: show the next frame of the clip in each picture, and the first again after the last.
+        about: what the orbit turns about; the object if there is one.
+        pictures: of the orbit; 120, or with --play the clip's number of frames.
+        size: width and height, where the cameras have none of their own; the clip's if not given. An orbit
+            and the clip's own camera keep their vertical angle.
+        world: what the cameras of a file are placed in: the clip's camera frame (x right, y down, z forward;
+            metres), which is the default, or the object's own frame, which stands still as the object moves.
+        video: an .mp4 file of the pictures, 30 a second or as many as a camera path says; needs the extra
+            video.
+        depth: also write OUT/depth/0000.png in 16-bit millimetres, or 0000.npy in metres; 0 where nothing is.
+        background: white, black, R,G,B (each 0 to 255) or transparent, which is black in a video.
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.rendering import render_cameras
+    from bigs.commands.views import Shot, Wanted, background_of, render_run
 
-    files = render_cameras(run, cameras, out)
-    say(f"{len(files)} pictures in {out}")
+    shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
+    wanted = Wanted(out, video, depth, background_of(background))
+    with stderr.status("starting") as status:
+        files = render_run(run, shot, wanted, status.update)
+    rendered = sum(path.parent == out for path in files)
+    if out is not None:
+        beside = "" if depth is None else f", their depth in {out / 'depth'}"
+        say(f"{rendered} pictures in {out}{beside}")
+    if video is not None:
+        say(str(video))
 
 
 def export(

@@ -1,7 +1,6 @@
-"""Cameras to render from: `transforms.json` as instant-ngp and nerfstudio write it.
+"""`transforms.json` as instant-ngp, nerfstudio and Blender's exporters for NeRF write it.
 
-Each frame has `frame_index`, the time of the clip to show, and `transform_matrix`, camera to world with
-OpenGL camera axes (x right, y up, looking along -z). World is the camera frame of that time, OpenCV axes.
+Each frame has `transform_matrix`, camera to world with OpenGL camera axes (x right, y up, looking along -z).
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bigs.checks import InputError
-from bigs.data.fields import array_field, mapping_field, read_json, require
+from bigs.checks import InputError, shown
+from bigs.data.fields import array_field, mapping_field, number_field, read_json, require
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -23,6 +22,9 @@ _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # Rotations in such files are printed with six digits or more.
 _RIGID_TOLERANCE = 1e-4
+
+# So many pictures, each of so many pixels, are rendered at most: an hour and half a gigabyte.
+MOST_CAMERAS, MOST_PIXELS = 10_000, 4096 * 4096
 
 
 class RenderCamera(NamedTuple):
@@ -46,39 +48,28 @@ class PlacedCamera(NamedTuple):
     height: int
 
 
-def load_transforms(path: str | Path, *, frame_count: int | None = None) -> list[RenderCamera]:
-    """Read the cameras of a `transforms.json`, in the file's order.
-
-    Args:
-        path: the file.
-        frame_count: how many frames the clip has; a larger `frame_index` is then an error.
-
-    Raises:
-        InputError: not JSON, a missing field, distortion, a matrix that is not rigid, a frame out of range.
-    """
-    cameras = []
-    for camera in read_cameras(path):
-        frame_index = _count(camera.where, camera.entry, "frame_index", 0)
-        if frame_count is not None and frame_index >= frame_count:
-            raise InputError(
-                f"{camera.where}.frame_index: expected at most {frame_count - 1}, the clip's last frame, "
-                f"found {frame_index}"
-            )
-        cameras.append(RenderCamera(frame_index, camera.viewmat, camera.K, camera.width, camera.height))
-    return cameras
-
-
 def read_cameras(path: str | Path) -> list[PlacedCamera]:
     """The cameras of a `transforms.json` as they stand, whatever their frames are called.
 
     Raises:
-        InputError: as `load_transforms`.
+        InputError: not JSON, a missing field, distortion, or a matrix that is not rigid.
     """
     path = Path(path)
-    document = mapping_field(str(path), read_json(path))
+    return cameras_in(path, mapping_field(str(path), read_json(path)))
+
+
+def cameras_in(
+    path: Path, document: Mapping[str, Any], size: tuple[int, int] | None = None
+) -> list[PlacedCamera]:
+    """The cameras of what a `transforms.json` holds; `size` is that of frames that name none.
+
+    Raises:
+        InputError: as `read_cameras`.
+    """
     frames = require(f"{path}: frames", document, "frames")
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: frames: expected a list of cameras, found {_brief(frames)}")
+        raise InputError(f"{path}: frames: expected a list of cameras, found {shown(frames)}")
+    check_cameras(f"{path}: frames", len(frames))
     cameras = []
     for index, stored in enumerate(frames):
         where = f"{path}: frames[{index}]"
@@ -86,14 +77,16 @@ def read_cameras(path: str | Path) -> list[PlacedCamera]:
         # What a frame says about its lens overrides what the file says for all.
         values = {**document, **entry}
         _check_lens(where, values)
-        width, height = _count(where, values, "w", 1), _count(where, values, "h", 1)
+        width, height = size_field(f"{where}.", values, "w", "h", size)
         K = _intrinsics(where, values, width, height)
-        cameras.append(PlacedCamera(where, entry, _viewmat(where, entry), K, width, height))
+        matrix = require(f"{where}.transform_matrix", entry, "transform_matrix")
+        viewmat = viewmat_field(f"{where}.transform_matrix", matrix)
+        cameras.append(PlacedCamera(where, entry, viewmat, K, width, height))
     return cameras
 
 
 def write_transforms(path: str | Path, cameras: Sequence[RenderCamera]) -> None:
-    """Write `cameras` so that `load_transforms` returns them; intrinsics are stored with each frame."""
+    """Write `cameras` so that `render_cameras.load_cameras` returns them; each frame has its intrinsics."""
     frames = [
         {
             "file_path": f"{index:04d}.png",
@@ -118,7 +111,7 @@ def _check_lens(where: str, values: Mapping[str, Any]) -> None:
             f"{where}.camera_model: expected one of {', '.join(_PINHOLE_MODELS)}, found {model!r}"
         )
     for key in _DISTORTION:
-        if key in values and _number(f"{where}.{key}", values[key]) != 0:
+        if key in values and number_field(f"{where}.{key}", values[key]) != 0:
             raise InputError(f"{where}.{key}: expected a camera without distortion, found {values[key]}")
 
 
@@ -127,33 +120,55 @@ def _intrinsics(where: str, values: Mapping[str, Any], width: int, height: int) 
     if fl_x is None:
         raise InputError(f"{where}.fl_x: expected fl_x or camera_angle_x, found neither")
     fl_y = _focal(where, values, "fl_y", "camera_angle_y", height)
-    cx = _number(f"{where}.cx", values.get("cx", width / 2))
-    cy = _number(f"{where}.cy", values.get("cy", height / 2))
+    cx = number_field(f"{where}.cx", values.get("cx", width / 2))
+    cy = number_field(f"{where}.cy", values.get("cy", height / 2))
     return np.array([[fl_x, 0.0, cx], [0.0, fl_x if fl_y is None else fl_y, cy], [0.0, 0.0, 1.0]])
 
 
 def _focal(where: str, values: Mapping[str, Any], key: str, angle_key: str, pixels: int) -> float | None:
     """The focal length in pixels, from itself or from the field of view; None if the file gives neither."""
     if key in values:
-        focal = _number(f"{where}.{key}", values[key])
+        focal = number_field(f"{where}.{key}", values[key])
         if focal <= 0:
             raise InputError(f"{where}.{key}: expected a positive focal length, found {focal:g}")
         return focal
     if angle_key in values:
-        angle = _number(f"{where}.{angle_key}", values[angle_key])
+        angle = number_field(f"{where}.{angle_key}", values[angle_key])
         if not 0 < angle < math.pi:
             raise InputError(f"{where}.{angle_key}: expected an angle between 0 and pi, found {angle:g}")
         return 0.5 * pixels / math.tan(0.5 * angle)
     return None
 
 
-def _viewmat(where: str, entry: Mapping[str, Any]) -> np.ndarray:
-    where = f"{where}.transform_matrix"
-    stored = require(where, entry, "transform_matrix")
+def size_field(
+    prefix: str, values: Mapping[str, Any], width_key: str, height_key: str, size: tuple[int, int] | None
+) -> tuple[int, int]:
+    """Width and height of a picture; `size` where neither is named. `prefix` goes before the keys."""
+    if size is not None and width_key not in values and height_key not in values:
+        return size
+    width, height = (count_field(f"{prefix}{key}", values, key, 1) for key in (width_key, height_key))
+    check_pixels(f"{prefix}{width_key}", width, height)
+    return width, height
+
+
+def check_cameras(where: str, count: int) -> None:
+    """Raise `InputError` if there are more cameras than are rendered in one go."""
+    if count > MOST_CAMERAS:
+        raise InputError(f"{where}: expected at most {MOST_CAMERAS} cameras, found {count}")
+
+
+def check_pixels(where: str, width: int, height: int) -> None:
+    """Raise `InputError` if a picture is larger than one that is rendered."""
+    if width * height > MOST_PIXELS:
+        raise InputError(f"{where}: expected at most {MOST_PIXELS} pixels, found {width} x {height}")
+
+
+def viewmat_field(where: str, stored: Any) -> np.ndarray:
+    """World to camera in OpenCV axes [4, 4], from four rows of camera to world in OpenGL axes."""
     try:
         matrix = np.asarray(stored)
     except ValueError:  # rows of different lengths
-        raise InputError(f"{where}: expected a 4 x 4 matrix, found {_brief(stored)}") from None
+        raise InputError(f"{where}: expected a 4 x 4 matrix, found {shown(stored)}") from None
     world_from_gl = array_field(where, matrix, (4, 4))
     rotation = world_from_gl[:3, :3]
     is_rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID_TOLERANCE)
@@ -162,20 +177,9 @@ def _viewmat(where: str, entry: Mapping[str, Any]) -> np.ndarray:
     return np.linalg.inv(world_from_gl @ CV_FROM_GL)
 
 
-def _count(where: str, values: Mapping[str, Any], key: str, least: int) -> int:
+def count_field(where: str, values: Mapping[str, Any], key: str, least: int) -> int:
     """A whole number of at least `least`; instant-ngp writes sizes as 1080.0."""
-    number = _number(f"{where}.{key}", require(f"{where}.{key}", values, key))
+    number = number_field(where, require(where, values, key))
     if number != int(number) or number < least:
-        raise InputError(f"{where}.{key}: expected a whole number of at least {least}, found {number:g}")
+        raise InputError(f"{where}: expected a whole number of at least {least}, found {number:g}")
     return int(number)
-
-
-def _number(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: expected a number, found {_brief(value)}")
-    return float(value)
-
-
-def _brief(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

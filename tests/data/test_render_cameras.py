@@ -1,4 +1,4 @@
-"""`transforms.json`: OpenGL cameras in, OpenCV cameras out, and strict about everything else."""
+"""Files of cameras: OpenGL cameras in, OpenCV cameras out, and strict about everything else."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
-from bigs.data.transforms import RenderCamera, load_transforms, write_transforms
+from bigs.data.render_cameras import load_cameras
+from bigs.data.transforms import MOST_CAMERAS, RenderCamera, write_transforms
 
 IDENTITY = np.eye(4).tolist()
 
@@ -26,7 +27,7 @@ def document(**changes: Any) -> dict[str, Any]:
 def load(tmp_path: Path, content: Any, **options: Any) -> list[RenderCamera]:
     file = tmp_path / "transforms.json"
     file.write_text(content if isinstance(content, str) else json.dumps(content))
-    return load_transforms(file, **options)
+    return load_cameras(file, **{"frame_count": 5} | options).cameras
 
 
 def test_an_opengl_camera_sees_what_lies_along_its_negative_z(tmp_path: Path) -> None:
@@ -58,7 +59,7 @@ def test_round_trip(tmp_path: Path) -> None:
         K = np.array([[80.0 + index, 0, 20], [0, 70.0, 30], [0, 0, 1]])
         cameras.append(RenderCamera(3 - index, viewmat, K, 40 + index, 60))
     write_transforms(tmp_path / "t.json", cameras)
-    loaded = load_transforms(tmp_path / "t.json", frame_count=4)
+    loaded = load_cameras(tmp_path / "t.json", frame_count=4).cameras
     for a, b in zip(cameras, loaded, strict=True):
         assert (a.frame_index, a.width, a.height) == (b.frame_index, b.width, b.height)
         np.testing.assert_allclose(a.viewmat, b.viewmat, atol=1e-12)
@@ -108,17 +109,22 @@ MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
         (document(w=None), r"frames\[0\]\.w"),
         (document(h=0), r"frames\[0\]\.h.*0"),
         (document(w=64.5), "whole number.*64.5"),
-        (document(w="64"), 'w: expected a number, found "64"'),
+        (document(w="64"), "w: expected .*number.*found str"),
         (document(fl_x=None), "fl_x or camera_angle_x"),
         (document(fl_x=0), "fl_x.*positive.*0"),
         (document(fl_x=None, camera_angle_x=4.0), "camera_angle_x.*pi"),
-        (document(cx=float("nan")), "cx.*NaN"),
+        (document(cx=float("nan")), "cx.*nan"),
         (document(k1=0.1), "k1.*distortion.*0.1"),
         (document(camera_model="OPENCV_FISHEYE"), "camera_model.*FISHEYE"),
-        (frame(frame_index=None), "frame_index"),
+        (frame(frame_index=None), "frame_index: expected this field, or .*--frame N or --play"),
+        (
+            document(w=16384, h=16384),
+            r"frames\[0\]\.w: expected at most 16777216 pixels, found 16384 x 16384",
+        ),
+        (document(frames=[3] * (MOST_CAMERAS + 1)), "frames: expected at most 10000 cameras, found 10001"),
         (frame(frame_index=-1), "frame_index.*-1"),
         (frame(frame_index=1.5), "frame_index.*1.5"),
-        (frame(frame_index=True), "frame_index.*true"),
+        (frame(frame_index=True), "frame_index.*True"),
         (frame(frame_index=9), "frame_index.*at most 4.*9"),
         (frame(transform_matrix=None), "transform_matrix"),
         (frame(transform_matrix=IDENTITY[:3]), r"transform_matrix.*\[4, 4\].*\[3, 4\]"),
@@ -130,10 +136,93 @@ MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
 )
 def test_what_is_wrong(tmp_path: Path, content: Any, words: str) -> None:
     with pytest.raises(InputError, match=rf"transforms\.json: .*{words}") as caught:
-        load(tmp_path, content, frame_count=5)
+        load(tmp_path, content)
     assert "\n" not in str(caught.value)
 
 
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
-        load_transforms(tmp_path / "none.json")
+        load_cameras(tmp_path / "none.json", frame_count=5)
+
+
+BLENDER = {
+    "camera_angle_x": math.pi / 2,
+    "frames": [
+        {"file_path": f"./train/r_{i}", "rotation": 0.01, "transform_matrix": IDENTITY} for i in (0, 1)
+    ],
+}
+
+
+def test_blenders_cameras_get_size_and_time(tmp_path: Path) -> None:
+    cameras = load(tmp_path, BLENDER, size=(80, 60), time_of=lambda index: 4 - index)
+    assert [camera.frame_index for camera in cameras] == [4, 3]
+    for camera in cameras:
+        assert (camera.width, camera.height) == (80, 60)
+        np.testing.assert_allclose(camera.K, [[40, 0, 40], [0, 40, 30], [0, 0, 1]])
+
+
+def test_a_time_is_not_given_twice(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"frames\[0\]\.frame_index: expected none beside --frame or --play"):
+        load(tmp_path, document(), time_of=lambda index: 0)
+
+
+# OpenGL axes: one step to the right of the world's origin, turned by a quarter to look along +x.
+LOOKS_ALONG_X = [0, 0, -1, 1, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
+
+
+def camera_path(**changes: Any) -> dict[str, Any]:
+    """As nerfstudio's viewer saves it."""
+    entry = {"camera_to_world": LOOKS_ALONG_X, "fov": 90.0, "aspect": 1.5}
+    base: dict[str, Any] = {
+        "camera_type": "perspective",
+        "render_height": 40,
+        "render_width": 60,
+        "fps": 24,
+        "seconds": 0.5,
+        "is_cycle": False,
+        "keyframes": [],
+        "camera_path": [entry],
+    }
+    of_camera = {key: value for key, value in changes.items() if key in entry}
+    if of_camera:
+        base["camera_path"] = [{k: v for k, v in {**entry, **of_camera}.items() if v is not None}]
+        changes = {key: value for key, value in changes.items() if key not in entry}
+    return {key: value for key, value in (base | changes).items() if value is not None}
+
+
+def test_a_camera_path_of_nerfstudios_viewer(tmp_path: Path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(camera_path()))
+    found = load_cameras(file, frame_count=5, time_of=lambda index: 2)
+    (camera,) = found.cameras
+    assert found.fps == 24 and (camera.frame_index, camera.width, camera.height) == (2, 60, 40)
+    # The angle is the vertical one: 20 pixels up and 20 pixels away.
+    np.testing.assert_allclose(camera.K, [[20, 0, 30], [0, 20, 20], [0, 0, 1]])
+    # A point ahead, up, and to the right, which is the world's +z.
+    np.testing.assert_allclose(camera.viewmat @ [3.0, 0.5, 0.25, 1.0], [0.25, -0.5, 2.0, 1.0], atol=1e-12)
+    (sized,) = load(tmp_path, camera_path(render_height=None, render_width=None), size=(30, 20), time_of=int)
+    assert sized.K[1, 1] == pytest.approx(10) and (sized.width, sized.height) == (30, 20)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (camera_path(camera_type="equirectangular"), "camera_type: expected perspective, found 'equirect"),
+        (camera_path(camera_path=[]), "camera_path: expected a list of cameras"),
+        (camera_path(camera_path=[1]), r"camera_path\[0\]: expected a dictionary, found int"),
+        (camera_path(camera_path=[1] * 10_001), "camera_path: expected at most 10000 cameras, found 10001"),
+        (camera_path(camera_to_world=[1.0] * 12), r"\[0\]\.camera_to_world: expected a list of 16.*found 12"),
+        (camera_path(camera_to_world=[2.0] * 16), r"\[0\]\.camera_to_world: expected a rigid motion"),
+        (camera_path(camera_to_world=None), r"\[0\]\.camera_to_world: expected this field"),
+        (camera_path(fov=None), r"\[0\]\.fov: expected this field"),
+        (camera_path(fov=180), r"\[0\]\.fov: expected degrees between 0 and 180, found 180"),
+        (camera_path(fov="wide"), r"\[0\]\.fov: expected .*number.*found str"),
+        (camera_path(fps=0), "fps: expected a positive number, found 0"),
+        (camera_path(render_width=99999999), "expected at most 16777216 pixels, found 99999999 x 40"),
+        (camera_path(render_width=None), "render_width: expected this field"),
+    ],
+)
+def test_what_is_wrong_with_a_camera_path(tmp_path: Path, content: Any, words: str) -> None:
+    with pytest.raises(InputError, match=rf"transforms\.json: .*{words}") as caught:
+        load(tmp_path, content, time_of=lambda index: 0, size=(64, 48))
+    assert "\n" not in str(caught.value)
