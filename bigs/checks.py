@@ -26,6 +26,8 @@ ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
 )
 
 
+# Rotations are kept in float32 and in print with six digits.
+ROTATION_TOLERANCE = 1e-3
 # How much of a value from a file a message shows.
 _SHOWN = 80
 _BRIEFLY = reprlib.Repr()
@@ -60,6 +62,33 @@ def check_finite(name: str, array: Any) -> None:
     if not finite.all():
         index = tuple(int(i) for i in np.argwhere(~finite)[0])
         raise InputError(f"{name}: expected finite values, found {values[index]} at index {list(index)}")
+
+
+def check_rotations(name: str, matrices: Any) -> None:
+    """Raise `InputError` naming the first of `matrices` [..., 3, 3] that is no rotation."""
+    values = np.asarray(matrices, dtype=np.float64)
+    check_finite(name, values)
+    error = np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)).max(axis=(-1, -2), initial=0.0)
+    wrong = (error > ROTATION_TOLERANCE) | (np.linalg.det(values) < 0.0)
+    if wrong.any():
+        index = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise InputError(
+            f"{name}: expected a rotation (orthonormal, determinant +1), found {shown(values[index].tolist())}"
+            f" at index {list(index)}"
+        )
+
+
+def check_faces(name: str, faces: Any, vertex_count: int) -> None:
+    """Raise `InputError` unless `faces` [F, 3] are whole numbers that count `vertex_count` vertices."""
+    values = faces.detach().cpu().numpy() if isinstance(faces, torch.Tensor) else np.asarray(faces)
+    check_shape(name, values, ("F", 3))
+    if values.dtype.kind not in "iu" and not (values == np.floor(values)).all():
+        raise InputError(f"{name}: expected whole numbers, found {values.dtype}")
+    if values.size and (values.min() < 0 or values.max() >= vertex_count):
+        raise InputError(
+            f"{name}: expected indices from 0 to {vertex_count - 1}, found {values.min():g} to "
+            f"{values.max():g}"
+        )
 
 
 def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:

@@ -18,11 +18,12 @@ ROOT = Path(bigs.__file__).parent
 
 # A part is a top-level module or package of bigs; "bigs" itself is its version. Each may import itself and
 # what its entry names. Siblings are apart; what they share lies below them.
-BELOW = {"types", "checks", "atomic", "unpickle", "weights"}
+BELOW = {"types", "checks", "checksum", "atomic", "unpickle", "weights"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bigs": set(),
     "types": set(),
     "checks": set(),
+    "checksum": set(),
     "colmap": set(),
     "atomic": set(),
     "pickle_records": set(),

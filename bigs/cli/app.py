@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Union
 
 import tyro
 
 from bigs import __version__
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 from bigs.cli import batch, bench, clips, preprocess, prior, runs, scores
-from bigs.cli.terminal import fail, say
+from bigs.cli.terminal import fail, say, until_nobody_reads
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
 
@@ -58,30 +58,51 @@ GROUPS = {
     "bench": "Measure how fast and how exact this is.",
 }
 
+# How much of the text of an error that nobody foresaw is told.
+_REASON = 200
+
 # Groups that may be called without naming one of their commands.
 IMPLIED = {"preprocess": "all"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; the exit code is 0 only on success."""
-    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
-        say(f"bigs {__version__}")
-        return
+    """Run the command line; the exit code is 0 only on success.
+
+    With --debug, before or after the command, the traceback of whatever goes wrong is printed, too.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
     try:
-        _parse(_in_full(sys.argv[1:] if arguments is None else arguments))()
-    except InputError as error:
-        fail(str(error), 2)
-    except FloatingPointError as error:
-        fail(f"{error}; the last checkpoint is kept", 3)
-    except BrokenPipeError:
-        # Whoever read the output, as `head`, has enough. Python would complain once more as it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        fail(f"{place}expected a file or folder that can be read or written, found: {error.strerror}", 4)
+        if given == ["--version"]:
+            say(f"bigs {__version__}")
+        else:
+            _parse(_in_full(given))()
     except KeyboardInterrupt:
         fail("interrupted; --resume continues from the last checkpoint", 130)
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        fail(*_told(error))
+
+
+def _told(error: Exception) -> tuple[str, int]:
+    """One sentence on what ended a command, and its exit code."""
+    if isinstance(error, InputError):
+        return str(error), 2
+    if isinstance(error, FloatingPointError):
+        return f"{error}; the last checkpoint is kept", 3
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        reason = error.strerror or shown(error)
+        return f"{place}expected a file or folder that can be read or written, found: {reason}", 4
+    reason = " ".join(str(error).split())
+    told = f"{type(error).__name__}{f' ({reason[:_REASON]})' if reason else ''}"
+    return (
+        f"an error that bigs did not foresee: {told}; please report it with the command and the traceback, "
+        "which the same command shows with --debug",
+        1,
+    )
 
 
 def _in_full(arguments: list[str]) -> list[str]:
@@ -99,12 +120,12 @@ def _parse(arguments: list[str]) -> Callable[[], None]:
 
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), until_nobody_reads():
             return tyro.cli(
                 _choice_of(COMMANDS),
                 prog="bigs",
                 description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU. "
-                "The only option without a command is --version.",
+                "Without a command there is --version; --debug, with any, shows the traceback of an error.",
                 args=arguments,
             )
     except SystemExit as stop:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -26,13 +29,51 @@ Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 # A file or a pipe has no width; tables there are as wide as they need to be.
 _WIDTH_OF_A_FILE = 240
 
-stdout = Console(width=None if sys.stdout.isatty() else _WIDTH_OF_A_FILE)
-stderr = Console(stderr=True)
+
+class _Output(Console):
+    """A console whose reader may leave: what comes then is nobody's, and the command goes on to its end."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        stream = sys.stderr if self.stderr else sys.stdout
+        # What is still in the stream's buffer would else be tried once more as Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _open_streams() -> None:
+    """Give a process that was started with closed streams (`>&-`) some that lead nowhere.
+
+    Else the next file that is opened would take their place, and get what is meant for them. And a name from
+    a file system that is no text shall be shown somehow, on standard output as on standard error.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            with contextlib.suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            setattr(sys, name, open(os.devnull, "w" if number else "r"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+_open_streams()
+stdout = _Output(width=None if sys.stdout.isatty() else _WIDTH_OF_A_FILE)
+stderr = _Output(stderr=True)
 
 
 def say(text: str) -> None:
     """A line on standard output, as it is: nothing coloured, nothing wrapped."""
     stdout.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def until_nobody_reads() -> Iterator[None]:
+    """End the command, well, when the reader of a help text, which others print, has left."""
+    try:
+        yield
+    except BrokenPipeError:
+        stdout.on_broken_pipe()
+        sys.exit(0)
 
 
 def fail(message: str, code: int) -> NoReturn:

@@ -25,7 +25,8 @@ from bigs.export.splat_glb import save_splat_glb
 from bigs.export.spz import save_spz
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import JOINT_NAMES, MANO_PARENTS, mirror_axis_angle, mirror_points, mirror_rotation
-from bigs.models.playback import HandPlayback, Playback, save_playback
+from bigs.models.playback import HandPlayback, Playback
+from bigs.models.playback_file import save_playback
 from bigs.models.repose import wrist_of
 from bigs.types import Entity, Gaussians, Side
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
-from bigs.models.playback import Playback, load_playback
+from bigs.models.playback import Playback
+from bigs.models.playback_file import load_playback
 
 CHECKPOINTS = "checkpoints"
 CONFIG = "config.yaml"

@@ -98,7 +98,7 @@ def _plausible_object(clip: Clip, track: ObjectTrack, notes: list[str]) -> Objec
     radius = float(np.percentile(distance, 90))
     if not SHORTEST_M < 2.0 * radius < LONGEST_M:
         raise InputError(
-            f"{clip.folder}: object: expected points of {SHORTEST_M:g} to {LONGEST_M:g} m in all once scaled, "
+            f"{clip.folder}: object: expected points of {SHORTEST_M:g} to {LONGEST_M:g} m once scaled, "
             f"found {2.0 * radius:.3g} m (scale {track.scale:.3g})"
         )
     kept = distance <= STRAY * radius
@@ -195,7 +195,7 @@ def _check_shift(clip: Clip) -> None:
     farthest = max(float(np.linalg.norm(_in_camera(clip, transl), axis=1).max()) for transl in tracks)
     if length == 0.0 or _HALF_SPACE / length * (farthest + LONGEST_M + length) > _HALF_MAX:
         raise InputError(
-            f"{clip.folder}: normalize_shift: expected the camera's distance from the scene's middle in metres, "
+            f"{clip.folder}: normalize_shift: expected the camera's place relative to the scene, metres, "
             f"found {length:.3g} for a scene that reaches {farthest:.3g} m"
         )
 

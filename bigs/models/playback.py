@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from bigs.atomic import atomic_write
-from bigs.checks import InputError
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
@@ -24,9 +17,7 @@ from bigs.models.lighting import Lighting, light
 from bigs.models.object_splats import CanonicalObject, pose_object
 from bigs.models.poses import ObjectFrames
 from bigs.models.scene import Scene, concatenate
-from bigs.types import SIDES, Entity, Gaussians, HandObjectTrajectory, Side
-
-FORMAT = "bigs-scene-3"
+from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 
 # What has a value for each frame.
 _MOVING_HAND = (
@@ -225,89 +216,6 @@ def record(
         scene.height,
         tuple(map(float, normalize_shift)),
         None if scene.lighting is None else scene.lighting.clip.detach().clone(),
-        hands,
-        obj,
-    )
-
-
-def save_playback(path: Path, playback: Playback) -> None:
-    """Write a playback as one safetensors file."""
-    tensors: dict[str, Tensor] = {"K": playback.K}
-    if playback.light is not None:
-        tensors["light"] = playback.light
-    for side, hand in playback.hands.items():
-        named = {f.name: getattr(hand, f.name) for f in fields(hand) if f.name != "splats"}
-        named |= {f"splats.{key}": value for key, value in hand.splats._asdict().items() if value is not None}
-        tensors |= {f"{side}.{key}": value for key, value in named.items()}
-    if playback.object is not None:
-        obj = playback.object
-        named = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name != "splats"}
-        named |= {f"splats.{key}": value for key, value in obj.splats._asdict().items()}
-        tensors |= {f"object.{key}": value for key, value in named.items()}
-    facts = {
-        "name": playback.name,
-        "frame_names": playback.frame_names,
-        "size": [playback.width, playback.height],
-        "normalize_shift": playback.normalize_shift,
-    }
-    # One key beside the format: the writer's order of keys differs from run to run, and files shall not.
-    metadata = {"bigs": json.dumps({"format": FORMAT, **facts})}
-    # Shared storage (one canonical hand for two sides) is written twice: a reader then needs no special case.
-    with atomic_write(path) as file:
-        file.write(save({key: value.contiguous().clone() for key, value in tensors.items()}, metadata))
-
-
-def load_playback(path: Path) -> Playback:
-    """Read what `save_playback` wrote.
-
-    Raises:
-        InputError: missing, damaged or of another format.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a finished run's scene, found no such file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {}).get("bigs", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
-    if metadata.get("format") != FORMAT:
-        raise InputError(f"{path}: expected format {FORMAT}, found {metadata.get('format')}")
-
-    try:
-        return _assemble(metadata, tensors)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: expected a whole scene file, found one with parts missing ({error})"
-        ) from error
-
-
-def _assemble(metadata: dict[str, Any], tensors: dict[str, Tensor]) -> Playback:
-    """A playback from the contents of its file; whatever is missing raises as it comes."""
-
-    def part(prefix: str) -> dict[str, Tensor]:
-        return {key.removeprefix(prefix): v for key, v in tensors.items() if key.startswith(prefix)}
-
-    hands: dict[Side, HandPlayback] = {}
-    for side in SIDES:
-        splats = part(f"{side}.splats.")
-        if splats:
-            whole = {key: splats.get(key) for key in CanonicalHand._fields}
-            rest = {k: v for k, v in part(f"{side}.").items() if not k.startswith("splats.")}
-            hands[side] = HandPlayback(**rest, splats=CanonicalHand(**whole))
-    obj = None
-    if "object.verts" in tensors:
-        rest = {k: v for k, v in part("object.").items() if not k.startswith("splats.")}
-        obj = ObjectPlayback(**rest, splats=CanonicalObject(**part("object.splats.")))
-    width, height = metadata["size"]
-    return Playback(
-        metadata["name"],
-        tuple(metadata["frame_names"]),
-        tensors["K"],
-        width,
-        height,
-        tuple(metadata["normalize_shift"]),
-        tensors.get("light"),
         hands,
         obj,
     )

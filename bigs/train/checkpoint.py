@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
+from bigs.checksum import checksum
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.object_splats import Anchors, ObjectSplats
@@ -69,14 +69,7 @@ def save_checkpoint(
 
 def _checksum(metadata: dict[str, str], tensors: dict[str, Tensor]) -> str:
     """Tells a file in which bits have changed from a whole one."""
-    total = 0
-    for key, text in sorted(metadata.items()):
-        if key != "checksum":
-            total = zlib.crc32(f"{key} {text}".encode(), total)
-    for name, value in sorted(tensors.items()):
-        total = zlib.crc32(f"{name} {value.dtype} {list(value.shape)}".encode(), total)
-        total = zlib.crc32(value.numpy().tobytes(), total)
-    return f"{total:08x}"
+    return checksum(json.dumps(sorted(item for item in metadata.items() if item[0] != "checksum")), tensors)
 
 
 def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:

@@ -26,7 +26,7 @@ from bigs.data.moving import in_world
 from bigs.data.writers import write_arctic, write_ho3d
 from bigs.hand import HandModel
 from bigs.metrics.picture import ALL_METRICS
-from bigs.models.playback import load_playback
+from bigs.models.playback_file import load_playback
 from bigs.types import Side
 
 pytestmark = pytest.mark.slow
