@@ -11,16 +11,17 @@ use pyo3::prelude::*;
 
 use crate::{Settings, run, value_error};
 
-/// The CPU feature level the kernels run at: avx512, avx2, neon or baseline.
+/// The CPU feature level the kernels run at: avx512, avx2, neon or baseline. Raises ValueError for an unknown
+/// `BIGS_RASTER_SIMD`.
 #[pyfunction]
-pub(crate) fn simd_level() -> &'static str {
-    bigs_raster::peak::simd_level()
+pub(crate) fn simd_level() -> PyResult<&'static str> {
+    bigs_raster::peak::simd_level().map_err(value_error)
 }
 
 /// Measured peak of one thread in 10⁹ float32 operations per second at that level; a multiply-add is two.
 #[pyfunction]
-pub(crate) fn fma_peak_gflops(py: Python<'_>) -> f64 {
-    py.detach(bigs_raster::peak::fma_peak_gflops)
+pub(crate) fn fma_peak_gflops(py: Python<'_>) -> PyResult<f64> {
+    py.detach(bigs_raster::peak::fma_peak_gflops).map_err(value_error)
 }
 
 type Array<'py> = PyReadonlyArrayDyn<'py, f32>;

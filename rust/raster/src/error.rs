@@ -40,6 +40,13 @@ pub enum RasterError {
         /// Basis functions that there are coefficients for.
         bases: usize,
     },
+    /// The environment variable `BIGS_RASTER_SIMD` names no level of CPU features that this machine has.
+    BadSimdLevel {
+        /// Its value.
+        found: String,
+        /// The levels of this machine, the best first.
+        available: Vec<&'static str>,
+    },
     /// More Gaussian-tile intersections than a 32-bit index can number.
     TooManyIntersections,
 }
@@ -64,6 +71,13 @@ impl fmt::Display for RasterError {
                 write!(
                     f,
                     "sh_degree: expected at most 3 and (degree + 1)² of the {bases} bases, found {degree}"
+                )
+            }
+            Self::BadSimdLevel { found, available } => {
+                write!(
+                    f,
+                    "BIGS_RASTER_SIMD: expected one of {}, found '{found}'",
+                    available.join(", ")
                 )
             }
             Self::TooManyIntersections => {

@@ -58,8 +58,7 @@ pub struct Counters {
 }
 
 impl<T: Scalar> BatchState<T> {
-    /// For every pixel of every view, the Gaussian at which half its light is gone; see
-    /// [`crate::Frame::median_ids`].
+    /// For every pixel of every view, the Gaussian at its median depth; see [`crate::Frame::median_ids`].
     pub fn median_ids(&self) -> Vec<i32> {
         let views: Vec<Vec<i32>> = self.views.par_iter().map(ViewState::median_ids).collect();
         views.concat()

@@ -27,8 +27,8 @@ pub struct Frame<T: Scalar> {
 }
 
 impl<T: Scalar> Frame<T> {
-    /// The Gaussian at which half of each pixel's light is gone, by rows and columns: the last of those that more than
-    /// half reaches, as in 2D Gaussian splatting. −1 where nothing is seen. Its depth is the pixel's median depth, and
+    /// The Gaussian at each pixel's median depth, by rows and columns: the last in front of which transmittance is above
+    /// one half, as in 2D Gaussian splatting. −1 where there is none. Its depth is the pixel's median depth, and
     /// has the gradient of that.
     #[must_use]
     pub fn median_ids(&self) -> Vec<i32> {

@@ -28,7 +28,7 @@ pub struct Stages<'a, T: Scalar> {
     depths: Vec<T>,
     radii: Vec<[i32; 2]>,
     projected: Pooled<Projected<T>>,
-    bins: Pooled<TileLists>,
+    lists: Pooled<TileLists>,
     scratch: Pooled<ListScratch<T>>,
     colors: Vec<T>,
     alphas: Vec<T>,
@@ -57,7 +57,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
         let grid = TileGrid::new(camera.width, camera.height, limits.tile_size);
         let n = gaussians.len();
         let (mut means2d, mut depths, mut radii) = (vec![[T::ZERO; 2]; n], vec![T::ZERO; n], vec![[0; 2]; n]);
-        let (mut projected, mut bins, mut scratch) = (Pooled::take(), Pooled::take(), Pooled::take());
+        let (mut projected, mut lists, mut scratch) = (Pooled::take(), Pooled::take(), Pooled::take());
         let screen = ScreenInfo {
             means2d: &mut means2d,
             depths: &mut depths,
@@ -72,8 +72,8 @@ impl<'a, T: Scalar> Stages<'a, T> {
             None,
             screen,
         );
-        T::bin(&mut projected, grid.len(), &mut scratch, &mut bins)?;
-        let scene = scene(&view, mode, &limits, &projected, &bins);
+        T::bin(&mut projected, grid.len(), &mut scratch, &mut lists)?;
+        let scene = scene(&view, mode, &limits, &projected, &lists);
         let pixels = grid.width * grid.height;
         let mut colors = vec![T::ZERO; pixels * scene.channels.total];
         let mut alphas = vec![T::ZERO; pixels];
@@ -92,7 +92,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
             depths,
             radii,
             projected,
-            bins,
+            lists,
             scratch,
             colors,
             alphas,
@@ -128,13 +128,13 @@ impl<'a, T: Scalar> Stages<'a, T> {
             &mut self.projected,
             self.grid.len(),
             &mut self.scratch,
-            &mut self.bins,
+            &mut self.lists,
         )
     }
 
     /// Composites all tiles into an image.
     pub fn composite(&mut self) -> &[T] {
-        let scene = scene(&self.view, self.mode, &self.limits, &self.projected, &self.bins);
+        let scene = scene(&self.view, self.mode, &self.limits, &self.projected, &self.lists);
         self.canvas = T::composite(&scene, &mut self.colors, &mut self.alphas);
         &self.colors
     }
@@ -146,7 +146,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
     pub fn composite_vjp(&mut self, v_colors: &[T], v_alphas: &[T]) -> Result<(), RasterError> {
         check_length("v_colors", self.colors.len(), v_colors.len())?;
         check_length("v_alphas", self.alphas.len(), v_alphas.len())?;
-        let scene = scene(&self.view, self.mode, &self.limits, &self.projected, &self.bins);
+        let scene = scene(&self.view, self.mode, &self.limits, &self.projected, &self.lists);
         let v = Cotangents {
             colors: v_colors,
             alphas: v_alphas,
@@ -158,15 +158,15 @@ impl<'a, T: Scalar> Stages<'a, T> {
     /// The vjp of [`Stages::project`], given what the last [`Stages::composite_vjp`] left.
     pub fn project_vjp(&self) -> GaussianGrads<T> {
         let mut grads = GaussianGrads::zeros(&self.view.gaussians, false);
-        let channels = scene(&self.view, self.mode, &self.limits, &self.projected, &self.bins).channels;
+        let channels = scene(&self.view, self.mode, &self.limits, &self.projected, &self.lists).channels;
         T::project_vjp(
             &self.view.gaussians,
             &self.view.camera,
             &self.limits,
             &self.projected,
-            &self.bins,
+            &self.lists,
             channels,
-            self.gradients.slots.written(),
+            self.gradients.intersections.written(),
             grads.slices(),
         );
         grads
@@ -180,11 +180,11 @@ impl<'a, T: Scalar> Stages<'a, T> {
             limits.max_alpha.as_f64(),
             limits.min_transmittance.as_f64(),
         );
-        let (bins, size) = (&*self.bins, self.grid.tile_size);
-        let in_pixel = |ranks: &[u32], column: usize, row: usize| {
+        let (lists, size) = (&*self.lists, self.grid.tile_size);
+        let in_pixel = |gaussians: &[u32], column: usize, row: usize| {
             let (mut pairs, mut transmittance) = (0, 1.0);
-            for &rank in ranks {
-                let splat = &self.projected.splats[rank as usize];
+            for &gaussian in gaussians {
+                let splat = &self.projected.splats[gaussian as usize];
                 let dx = column as f64 + 0.5 - splat.x.as_f64();
                 let dy = row as f64 + 0.5 - splat.y.as_f64();
                 let u = splat.w11.as_f64() * dx + splat.w12.as_f64() * dy;
@@ -204,12 +204,15 @@ impl<'a, T: Scalar> Stages<'a, T> {
         (0..self.grid.len())
             .into_par_iter()
             .map(|tile| {
-                let ranks = &bins.ranks[bins.offsets[tile] as usize..bins.offsets[tile + 1] as usize];
+                let gaussians =
+                    &lists.gaussians[lists.offsets[tile] as usize..lists.offsets[tile + 1] as usize];
                 let (left, top) = self.grid.origin(tile);
                 let rows = top..(top + size).min(self.grid.height);
                 rows.map(|row| {
                     let columns = left..(left + size).min(self.grid.width);
-                    columns.map(|column| in_pixel(ranks, column, row)).sum::<usize>()
+                    columns
+                        .map(|column| in_pixel(gaussians, column, row))
+                        .sum::<usize>()
                 })
                 .sum::<usize>()
             })

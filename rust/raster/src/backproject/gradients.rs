@@ -1,19 +1,18 @@
-//! The vjp of projecting a view: from the compositor's slots to the gradients of Gaussians and camera.
+//! The vjp of projecting a view: from the gradients of intersections to those of Gaussians and camera.
 
 use rayon::prelude::*;
 
 use crate::backproject::dispatch;
-use crate::backproject::sum_tiles::{ChunkSlots, ScreenGradients};
+use crate::backproject::sum_tiles::{PacketIntersections, ScreenGradients};
 use crate::composite::kernel::Channels;
 use crate::input::camera::Camera;
 use crate::input::gaussians::Gaussians;
 use crate::input::settings::Limits;
 use crate::lists::tile_lists::TileLists;
 use crate::math::real::Real;
-use crate::project::packet::{CHUNK, ChunkGradients};
+use crate::project::packet::{PACKET_SIZE, PacketGradients};
 use crate::project::projected::Projected;
-use crate::project::splat::Lens;
-use crate::simd::level::SimdLevel;
+use crate::project::splat::Projection;
 
 /// Where the gradients of a view go; an empty slice is one that nobody asked for.
 pub(crate) struct ViewGradients<'a, T> {
@@ -40,15 +39,15 @@ fn pieces<U>(values: &mut [U], size: usize, count: usize) -> Vec<&mut [U]> {
     }
 }
 
-/// Gradients of the Gaussians and of the camera, given what the compositor's vjp left in its slots.
+/// Gradients of the Gaussians and of the camera, given those of the intersections.
 pub(crate) fn project_view_vjp<T: Real>(
     gaussians: &Gaussians<'_, T>,
     camera: &Camera<T>,
     limits: &Limits<T>,
     projected: &Projected<T>,
-    bins: &TileLists,
+    lists: &TileLists,
     channels: Channels<'_, T>,
-    slots: &[T],
+    intersections: &[T],
     out: ViewGradients<'_, T>,
 ) {
     let (stride, colored) = (channels.stride, channels.colored);
@@ -62,29 +61,29 @@ pub(crate) fn project_view_vjp<T: Real>(
     if !geometry && out.means2d.is_empty() && !absolute && (out.colors.is_empty() || colored == 0) {
         return;
     }
-    let (lens, level) = (Lens::new(camera, limits), SimdLevel::detect());
+    let (projection, level) = (Projection::new(camera, limits), limits.level);
     let covers = projected.covers();
     let count = covers.len();
     let v_viewmats: Vec<[[T; 4]; 3]> = (
-        pieces(out.means, CHUNK, count),
-        pieces(out.quats, CHUNK, count),
-        pieces(out.scales, CHUNK, count),
-        pieces(out.opacities, CHUNK, count),
-        pieces(out.colors, CHUNK * stride.max(1), count),
-        pieces(out.means2d, CHUNK, count),
-        pieces(out.absgrad, CHUNK, count),
+        pieces(out.means, PACKET_SIZE, count),
+        pieces(out.quats, PACKET_SIZE, count),
+        pieces(out.scales, PACKET_SIZE, count),
+        pieces(out.opacities, PACKET_SIZE, count),
+        pieces(out.colors, PACKET_SIZE * stride.max(1), count),
+        pieces(out.means2d, PACKET_SIZE, count),
+        pieces(out.absgrad, PACKET_SIZE, count),
         covers,
     )
         .into_par_iter()
         .enumerate()
         .map(
-            |(chunk, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
-                let first = chunk * CHUNK;
-                let from = ChunkSlots {
-                    values: slots,
+            |(packet, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
+                let first = packet * PACKET_SIZE;
+                let from = PacketIntersections {
+                    values: intersections,
                     channels,
                     absolute,
-                    positions: &bins.positions,
+                    positions: &lists.positions,
                     cover,
                     splats: &projected.splats[first..first + cover.len()],
                 };
@@ -94,10 +93,10 @@ pub(crate) fn project_view_vjp<T: Real>(
                     absgrad,
                     detach_means2d: out.detach_means2d,
                 };
-                let mut v = ChunkGradients::new();
+                let mut v = PacketGradients::new();
                 dispatch::gather(level, &from, screen, &mut v);
                 if geometry && v.len > 0 {
-                    dispatch::vjp(level, gaussians, first, &lens, want_camera, &mut v);
+                    dispatch::vjp(level, gaussians, first, &projection, want_camera, &mut v);
                     v.add_to(means, quats, scales, opacities);
                 }
                 v.viewmat

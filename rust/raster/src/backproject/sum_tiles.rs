@@ -1,29 +1,29 @@
-//! From the slots of (Gaussian, tile) pairs to the gradients of splats: sums in the order of the tiles.
+//! From the gradients of intersections to those of splats: sums in the order of the tiles.
 
+use crate::composite::intersection_gradients::gradient_size;
 use crate::composite::kernel::{ABSOLUTES, Channels, LANES, MOMENTS};
-use crate::composite::slots::slot_size;
 use crate::math::real::Real;
-use crate::project::packet::{ChunkGradients, is_sound};
+use crate::project::packet::{PacketGradients, is_sound};
 use crate::project::splat::Splat;
 use crate::project::tiles::Cover;
 use crate::simd::prefetch;
 
-/// Slots that are asked for ahead of the one being summed.
+/// IntersectionGradients that are asked for ahead of the one being summed.
 const AHEAD: usize = 16;
 
-/// The slots of a chunk of Gaussians.
-pub(crate) struct ChunkSlots<'a, T> {
-    /// Of all chunks.
+/// The gradients of the intersections of a packet of Gaussians.
+pub(crate) struct PacketIntersections<'a, T> {
+    /// Of all packets.
     pub(crate) values: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) absolute: bool,
-    /// Of all chunks: see [`crate::lists::tile_lists::TileLists::positions`].
+    /// Of all packets: see [`crate::lists::tile_lists::TileLists::positions`].
     pub(crate) positions: &'a [u32],
     pub(crate) cover: &'a Cover,
     pub(crate) splats: &'a [Splat<T>],
 }
 
-/// Gradients of a chunk that no camera has a part in; an empty slice is one that nobody asked for.
+/// Where the gradients of a packet go that do not pass through the camera; an empty slice is one that nobody asked for.
 pub(crate) struct ScreenGradients<'a, T> {
     pub(crate) colors: &'a mut [T],
     pub(crate) means2d: &'a mut [[T; 2]],
@@ -32,7 +32,7 @@ pub(crate) struct ScreenGradients<'a, T> {
     pub(crate) detach_means2d: bool,
 }
 
-/// The sums of one Gaussian's slots.
+/// The sums over one Gaussian's intersections.
 struct Sums<T> {
     moments: [T; MOMENTS],
     /// Gradient of depth as a channel.
@@ -40,8 +40,9 @@ struct Sums<T> {
     absolutes: [T; ABSOLUTES],
 }
 
-impl<T: Real> ChunkSlots<'_, T> {
-    /// Sums values `first..first + LANES` of the slots at these positions; more than a slot has mean nothing.
+impl<T: Real> PacketIntersections<'_, T> {
+    /// Sums values `first..first + LANES` of the gradients at these positions; values beyond a gradient's size are of no
+    /// meaning.
     #[inline(always)]
     fn vector(&self, positions: &[u32], size: usize, first: usize) -> [T; LANES] {
         let mut sum = [T::ZERO; LANES];
@@ -54,7 +55,7 @@ impl<T: Real> ChunkSlots<'_, T> {
         sum
     }
 
-    /// Sums the slots of one Gaussian; writes the gradients of its colours to `colors` (none if empty).
+    /// Sums the gradients of one Gaussian's intersections; writes the gradients of its colours to `colors` (none if empty).
     #[inline(always)]
     fn sums(&self, positions: &[u32], size: usize, colors: &mut [T]) -> Sums<T> {
         let Channels { total, colored, .. } = self.channels;
@@ -92,7 +93,8 @@ impl<T: Real> ChunkSlots<'_, T> {
     }
 }
 
-/// A gradient, or none if it is beyond the scalar's range, as in [`crate::project::packet::vjp_chunk`]; `from` is what it was made of.
+/// A gradient, or zeros if it is out of the scalar's range though `from`, which it was made of, is not; as in
+/// [`packet_vjp`](crate::project::packet::packet_vjp).
 #[inline(always)]
 fn kept<T: Real>(gradient: [T; 2], from: [T; 2]) -> [T; 2] {
     if !is_sound(gradient) & is_sound(from) {
@@ -102,23 +104,24 @@ fn kept<T: Real>(gradient: [T; 2], from: [T; 2]) -> [T; 2] {
     }
 }
 
-/// Sums the slots of each Gaussian of a chunk, and packs the moments for [`crate::project::packet::vjp_chunk`].
+/// Sums the gradients of each Gaussian's intersections, and packs the moments for
+/// [`packet_vjp`](crate::project::packet::packet_vjp).
 #[inline(always)]
-pub(crate) fn gather_chunk<T: Real>(
-    from: &ChunkSlots<'_, T>,
+pub(crate) fn sum_packet<T: Real>(
+    from: &PacketIntersections<'_, T>,
     out: ScreenGradients<'_, T>,
-    v: &mut ChunkGradients<T>,
+    v: &mut PacketGradients<T>,
 ) {
-    let size = slot_size(from.channels.total, from.absolute);
+    let size = gradient_size(from.channels.total, from.absolute);
     let Channels { stride, colored, .. } = from.channels;
     // alpha = opacity · 2^e, e = −(u² + v²).
     let gain = T::of(2.0 * std::f64::consts::LN_2);
     for local in 0..from.cover.len() {
-        let own = from.cover.pairs_of(local);
+        let own = from.cover.intersections_of(local);
         if own.is_empty() {
             continue;
         }
-        // Slots lie tile by tile: one Gaussian's, and the next one's, are far apart.
+        // IntersectionGradients lie tile by tile: one Gaussian's, and the next one's, are far apart.
         let ahead = (own.start + AHEAD).min(from.positions.len());
         for &position in &from.positions[ahead..(ahead + own.len()).min(from.positions.len())] {
             prefetch(from.values, position as usize * size);

@@ -11,7 +11,7 @@ use crate::math::real::Real;
 const MAX_DEGREE: usize = 3;
 
 /// Gaussians handled by one task. Fixed, so that sums do not depend on the number of threads.
-const CHUNK: usize = 512;
+const PACKET_SIZE: usize = 512;
 
 /// Checked coefficients and directions of spherical harmonics; see [`crate::Harmonics`].
 #[derive(Clone, Copy, Debug)]
@@ -94,11 +94,11 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
     fn evaluate_bands<const B: usize>(&self) -> Vec<[T; 3]> {
         let n = self.gaussians();
         let mut colors = vec![[T::ZERO; 3]; self.dirs.len()];
-        let pieces = by_chunk(&mut colors, n);
-        pieces.into_par_iter().enumerate().for_each(|(chunk, places)| {
+        let pieces = by_packet(&mut colors, n);
+        pieces.into_par_iter().enumerate().for_each(|(packet, places)| {
             for (place, colors) in places.into_iter().enumerate() {
                 for (local, color) in colors.iter_mut().enumerate() {
-                    let gaussian = chunk * CHUNK + local;
+                    let gaussian = packet * PACKET_SIZE + local;
                     let at = place * n + gaussian;
                     if self.shown(at) {
                         let basis = basis::<T, B>(unit(self.dirs[at]).0);
@@ -116,22 +116,25 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
 
     fn vjp_bands<const B: usize>(&self, v_colors: &[[T; 3]], out: &mut HarmonicsGradients<T>) {
         let n = self.gaussians();
-        let chunks = n.div_ceil(CHUNK);
+        let packets = n.div_ceil(PACKET_SIZE);
         let places = self.dirs.len().checked_div(n).unwrap_or(0);
-        let mut v_dirs = by_chunk(&mut out.dirs, n);
-        v_dirs.resize_with(chunks, Vec::new);
-        let mut v_coefficients: Vec<&mut [T]> = out.coefficients.chunks_mut(CHUNK * 3 * self.bases).collect();
-        v_coefficients.resize_with(chunks, || &mut []);
+        let mut v_dirs = by_packet(&mut out.dirs, n);
+        v_dirs.resize_with(packets, Vec::new);
+        let mut v_coefficients: Vec<&mut [T]> = out
+            .coefficients
+            .chunks_mut(PACKET_SIZE * 3 * self.bases)
+            .collect();
+        v_coefficients.resize_with(packets, || &mut []);
         (v_dirs, v_coefficients).into_par_iter().enumerate().for_each(
-            |(chunk, (mut v_dirs, v_coefficients))| {
-                let first = chunk * CHUNK;
-                for gaussian in first..(first + CHUNK).min(n) {
+            |(packet, (mut v_dirs, v_coefficients))| {
+                let first = packet * PACKET_SIZE;
+                for gaussian in first..(first + PACKET_SIZE).min(n) {
                     let local = gaussian - first;
                     let rows = self.rows::<B>(gaussian);
                     for place in 0..places {
                         let at = place * n + gaussian;
                         let v = v_colors[at];
-                        // What no pixel sees has no gradient, and its coefficients need not be read.
+                        // A Gaussian that no pixel sees has no gradient, and its coefficients need not be read.
                         if !self.shown(at) || v == [T::ZERO; 3] {
                             continue;
                         }
@@ -163,27 +166,27 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
     }
 }
 
-/// For each chunk of Gaussians, its part of every place.
-fn by_chunk<U>(values: &mut [U], gaussians: usize) -> Vec<Vec<&mut [U]>> {
+/// For each packet of Gaussians, its part of every place.
+fn by_packet<U>(values: &mut [U], gaussians: usize) -> Vec<Vec<&mut [U]>> {
     if values.is_empty() {
         return Vec::new();
     }
     let places = values.len() / gaussians;
-    let mut chunks: Vec<Vec<&mut [U]>> = (0..gaussians.div_ceil(CHUNK))
+    let mut packets: Vec<Vec<&mut [U]>> = (0..gaussians.div_ceil(PACKET_SIZE))
         .map(|_| Vec::with_capacity(places))
         .collect();
     for place in values.chunks_exact_mut(gaussians) {
-        for (chunk, part) in chunks.iter_mut().zip(place.chunks_mut(CHUNK)) {
-            chunk.push(part);
+        for (packet, part) in packets.iter_mut().zip(place.chunks_mut(PACKET_SIZE)) {
+            packet.push(part);
         }
     }
-    chunks
+    packets
 }
 
 /// The direction of a vector and the reciprocal of its length; zeros for the zero vector.
 #[inline(always)]
 fn unit<T: Real>(v: [T; 3]) -> ([T; 3], T) {
-    // Divided by the largest part first, so that the square of a short or a long one is still a number.
+    // Divided by the largest part first, so that no square leaves the scalar's range.
     let largest = v[0].abs().greater(v[1].abs()).greater(v[2].abs());
     if largest == T::ZERO {
         return ([T::ZERO; 3], T::ZERO);

@@ -1,4 +1,4 @@
-//! The vjp of `composite`: from the gradient of an image to one slot per (tile, splat).
+//! The vjp of `composite`: from the gradient of an image to one of each splat in each tile.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -6,13 +6,12 @@ use rayon::prelude::*;
 
 use crate::composite::dispatch;
 use crate::composite::forward::{Canvas, LEAST_ALPHA, cut};
+use crate::composite::intersection_gradients::{IntersectionGradients, gradient_size};
 use crate::composite::kernel::{BLOCK, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane};
 use crate::composite::scene::Scene;
-use crate::composite::slots::{Slots, slot_size};
 use crate::math::real::Real;
 use crate::memory::pool::Pooled;
 use crate::simd::Vectors;
-use crate::simd::level::SimdLevel;
 
 /// Gradients of an image.
 #[derive(Clone, Copy)]
@@ -25,7 +24,7 @@ pub(crate) struct Cotangents<'a, T> {
 /// What the compositor's vjp yields.
 #[derive(Debug)]
 pub(crate) struct CompositeGradients<T: Real> {
-    pub(crate) slots: Pooled<Slots<T>>,
+    pub(crate) intersections: Pooled<IntersectionGradients<T>>,
     pub(crate) background: Vec<T>,
     /// Tiles whose incoming gradient was zero.
     pub(crate) tiles_skipped: usize,
@@ -46,55 +45,58 @@ pub(crate) fn composite_vjp<T: Vectors>(
     v: Cotangents<'_, T>,
     absolute: bool,
 ) -> CompositeGradients<T> {
-    let level = SimdLevel::detect();
+    let level = scene.limits.level;
     let blocks = scene.blocks();
     let total = scene.channels.total;
-    let size = slot_size(total, absolute);
-    let mut slots = Pooled::<Slots<T>>::take();
-    let values = slots.values(scene.bins.ranks.len() * size);
+    let size = gradient_size(total, absolute);
+    let mut intersections = Pooled::<IntersectionGradients<T>>::take();
+    let values = intersections.values(scene.lists.gaussians.len() * size);
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     (
-        pieces_by_tile(values, &scene.bins.offsets, size),
+        pieces_by_tile(values, &scene.lists.offsets, size),
         backgrounds.par_chunks_mut(total),
     )
         .into_par_iter()
         .enumerate()
-        .for_each_init(TileGradients::new, |incoming, (tile, (slots, v_background))| {
-            let mut task = scene.task(tile);
-            if task.ranks.is_empty() && scene.background.is_none() {
-                return;
-            }
-            let own = tile * blocks..(tile + 1) * blocks;
-            let transmittance = &canvas.transmittance[own.clone()];
-            let mut skipped = true;
-            while task.first < total {
-                let any = incoming.load(scene, canvas, tile, task.first, v);
-                if scene.background.is_some() {
-                    for k in 0..(total - task.first).min(MAX_CHANNELS) {
-                        v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
+        .for_each_init(
+            TileGradients::new,
+            |incoming, (tile, (intersections, v_background))| {
+                let mut task = scene.task(tile);
+                if task.gaussians.is_empty() && scene.background.is_none() {
+                    return;
+                }
+                let own = tile * blocks..(tile + 1) * blocks;
+                let transmittance = &canvas.transmittance[own.clone()];
+                let mut skipped = true;
+                while task.first < total {
+                    let any = incoming.load(scene, canvas, tile, task.first, v);
+                    if scene.background.is_some() {
+                        for k in 0..(total - task.first).min(MAX_CHANNELS) {
+                            v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
+                        }
                     }
+                    if !any {
+                        clear(intersections, size, task.first, total);
+                    } else if !task.gaussians.is_empty() {
+                        skipped = false;
+                        let cotangents = TileCotangents {
+                            transmittance,
+                            end: &canvas.end[own.clone()],
+                            masks: &canvas.masks
+                                [scene.lists.offsets[tile] as usize..scene.lists.offsets[tile + 1] as usize],
+                            v_values: &incoming.v_values,
+                            v_transmittance: &incoming.v_transmittance,
+                        };
+                        dispatch::backward(level, &task, &cotangents, intersections, size, absolute);
+                    }
+                    task.first += MAX_CHANNELS;
                 }
-                if !any {
-                    clear(slots, size, task.first, total);
-                } else if !task.ranks.is_empty() {
-                    skipped = false;
-                    let cotangents = TileCotangents {
-                        transmittance,
-                        end: &canvas.end[own.clone()],
-                        masks: &canvas.masks
-                            [scene.bins.offsets[tile] as usize..scene.bins.offsets[tile + 1] as usize],
-                        v_values: &incoming.v_values,
-                        v_transmittance: &incoming.v_transmittance,
-                    };
-                    dispatch::backward(level, &task, &cotangents, slots, size, absolute);
+                if skipped && !task.gaussians.is_empty() {
+                    tiles_skipped.fetch_add(1, Ordering::Relaxed);
                 }
-                task.first += MAX_CHANNELS;
-            }
-            if skipped && !task.ranks.is_empty() {
-                tiles_skipped.fetch_add(1, Ordering::Relaxed);
-            }
-        });
+            },
+        );
     let mut background = vec![T::ZERO; scene.channels.colored];
     for tile in backgrounds.chunks_exact(total) {
         for (sum, &v) in background.iter_mut().zip(tile) {
@@ -102,20 +104,20 @@ pub(crate) fn composite_vjp<T: Vectors>(
         }
     }
     CompositeGradients {
-        slots,
+        intersections,
         background,
         tiles_skipped: tiles_skipped.into_inner(),
     }
 }
 
 /// Zeroes what a kernel would have written for the channels of the group that starts with `first`.
-fn clear<T: Real>(slots: &mut [T], size: usize, first: usize, total: usize) {
+fn clear<T: Real>(gradients: &mut [T], size: usize, first: usize, total: usize) {
     if first == 0 {
-        slots.fill(T::ZERO);
+        gradients.fill(T::ZERO);
         return;
     }
-    for slot in slots.chunks_exact_mut(size) {
-        slot[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
+    for gradient in gradients.chunks_exact_mut(size) {
+        gradient[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
     }
 }
 

@@ -10,7 +10,6 @@ use crate::composite::scene::Scene;
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::simd::Vectors;
-use crate::simd::level::SimdLevel;
 
 /// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
 pub(crate) const LEAST_ALPHA: f64 = 1e-10;
@@ -22,11 +21,11 @@ pub(crate) struct Canvas<T> {
     pub(crate) transmittance: Vec<Lanes<T>>,
     /// See [`TileImage`]; not set for a tile that nothing reaches.
     pub(crate) end: Vec<Lanes<T>>,
-    /// Blocks reached, per entry of `TileLists::ranks`.
+    /// Which blocks of its tile each intersection reaches; in the order of `TileLists::gaussians`.
     pub(crate) masks: Vec<u16>,
     /// Accumulated depth where the image has expected depth, else empty; set as transmittance is.
     pub(crate) depths: Vec<Lanes<T>>,
-    /// Pixels at which the light ended before the list did.
+    /// Pixels that stopped before the end of their tile's list.
     pub(crate) saturated: usize,
 }
 
@@ -61,7 +60,7 @@ struct Strip<'a, T> {
     masks: &'a mut [u16],
 }
 
-/// Takes the first values off, or all there are: what nobody asked for is empty.
+/// Takes the first values off, or all there are: an array that nobody asked for is empty.
 pub(crate) fn cut<'a, U>(slice: &mut &'a mut [U], at: usize) -> &'a mut [U] {
     let at = at.min(slice.len());
     let (head, tail) = std::mem::take(slice).split_at_mut(at);
@@ -72,7 +71,7 @@ pub(crate) fn cut<'a, U>(slice: &mut &'a mut [U], at: usize) -> &'a mut [U] {
 impl<'a, T: Real> Strip<'a, T> {
     /// Takes the first `tiles` tiles off.
     fn take(&mut self, scene: &Scene<'_, T>, tiles: usize) -> Self {
-        let (blocks, offsets) = (scene.blocks(), &scene.bins.offsets);
+        let (blocks, offsets) = (scene.blocks(), &scene.lists.offsets);
         let pixels = tiles * scene.grid.tile_size;
         let total = scene.channels.total;
         let entries = offsets[self.tile + tiles] - offsets[self.tile];
@@ -119,7 +118,7 @@ pub(crate) fn composite<T: Vectors>(
         transmittance: stale(&mut out.transmittance, blocks),
         end: stale(&mut out.end, blocks),
         depths: stale(&mut out.depths, if scene.expected_depth { blocks } else { 0 }),
-        masks: stale(&mut out.masks, scene.bins.ranks.len()),
+        masks: stale(&mut out.masks, scene.lists.gaussians.len()),
     };
     let strips: Vec<Strip<'_, T>> = colors
         .chunks_mut(grid.tile_size * grid.width * total)
@@ -162,11 +161,11 @@ fn composite_tile<T: Vectors>(
     mut out: Strip<'_, T>,
 ) -> usize {
     let mut saturated = 0;
-    let level = SimdLevel::detect();
+    let level = scene.limits.level;
     let blocks = scene.blocks();
     let total = scene.channels.total;
     let mut task = scene.task(out.tile);
-    if task.ranks.is_empty() {
+    if task.gaussians.is_empty() {
         if scene.background.is_none() {
             return 0;
         }
@@ -180,7 +179,7 @@ fn composite_tile<T: Vectors>(
                 transmittance: &mut *out.transmittance,
                 end: &mut *out.end,
                 masks: &mut *out.masks,
-                // The same for every group of channels.
+                // Every group of channels counts the same pixels.
                 saturated: &mut saturated,
             };
             dispatch::forward(level, &task, &open, tile_image);

@@ -11,7 +11,7 @@ use crate::project::tiles::TileGrid;
 #[derive(Clone, Copy)]
 pub(crate) struct Scene<'a, T> {
     pub(crate) grid: TileGrid,
-    pub(crate) bins: &'a TileLists,
+    pub(crate) lists: &'a TileLists,
     pub(crate) splats: &'a [Splat<T>],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) expected_depth: bool,
@@ -25,7 +25,8 @@ impl<'a, T: Real> Scene<'a, T> {
         TileTask {
             origin: self.grid.origin(tile),
             side: self.grid.tile_size / BLOCK,
-            ranks: &self.bins.ranks[self.bins.offsets[tile] as usize..self.bins.offsets[tile + 1] as usize],
+            gaussians: &self.lists.gaussians
+                [self.lists.offsets[tile] as usize..self.lists.offsets[tile + 1] as usize],
             splats: self.splats,
             channels: self.channels,
             first: 0,

@@ -2,6 +2,7 @@
 
 use crate::error::RasterError;
 use crate::math::real::Real;
+use crate::simd::level::SimdLevel;
 
 /// The rules of the renderer. The defaults are gsplat's, so that images agree.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -151,6 +152,8 @@ pub(crate) struct Limits<T> {
     pub(crate) min_transmittance: T,
     pub(crate) exp_degree: u32,
     pub(crate) antialiased: bool,
+    /// What the stages run at.
+    pub(crate) level: SimdLevel,
 }
 
 impl<T: Real> Limits<T> {
@@ -173,6 +176,7 @@ impl<T: Real> Limits<T> {
             min_transmittance: T::of(settings.min_transmittance).greater(T::TRANSMITTANCE_FLOOR),
             exp_degree: settings.exp_degree,
             antialiased: settings.antialiased,
+            level: SimdLevel::chosen()?,
         })
     }
 }

@@ -18,7 +18,7 @@ impl<K> SortScratch<K> {
 
 /// Sorts `pairs` by key; equal keys keep their order. Every bit of the key counts.
 ///
-/// It takes as many passes as the difference of the greatest and the least key has dozens of bits.
+/// It takes one pass per twelve bits of the difference between the greatest and the least key.
 pub fn radix_sort<K: RadixKey>(pairs: &mut Vec<(K, u32)>) {
     radix_sort_with(pairs, &mut SortScratch::default());
 }
@@ -31,7 +31,7 @@ pub(crate) fn radix_sort_with<K: RadixKey>(pairs: &mut Vec<(K, u32)>, scratch: &
     ) else {
         return;
     };
-    // No more buckets than it takes: they compete with the pairs for the cache.
+    // As few buckets as the passes allow: they compete with the pairs for the cache.
     let bits = most.bits(least);
     let digits = bits.div_ceil(MOST_BITS);
     let width = bits.div_ceil(digits.max(1));

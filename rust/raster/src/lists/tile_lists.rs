@@ -5,7 +5,7 @@ use crate::lists::radix_sort::{SortScratch, radix_sort_with};
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, bytes_of, filled, stale};
 use crate::memory::shared_slice::Shared;
-use crate::project::packet::CHUNK;
+use crate::project::packet::PACKET_SIZE;
 use crate::project::projected::Projected;
 use crate::project::splat::Splat;
 use crate::project::tiles::Cover;
@@ -13,21 +13,21 @@ use crate::project::tiles::Cover;
 /// For every tile the splats that may reach it, front to back.
 #[derive(Debug, Default)]
 pub(crate) struct TileLists {
-    /// Tile t owns `ranks[offsets[t]..offsets[t + 1]]`.
+    /// Tile t owns `gaussians[offsets[t]..offsets[t + 1]]`.
     pub(crate) offsets: Vec<u32>,
     /// Indices of Gaussians.
-    pub(crate) ranks: Vec<u32>,
-    /// Gaussian by Gaussian and tile by tile: where in `ranks` it stands.
+    pub(crate) gaussians: Vec<u32>,
+    /// Intersection by intersection, Gaussian by Gaussian and within each tile by tile: where in `gaussians` it stands.
     pub(crate) positions: Vec<u32>,
 }
 
 impl Buffers for TileLists {
     fn bytes(&self) -> usize {
-        bytes_of(&self.offsets) + bytes_of(&self.ranks) + bytes_of(&self.positions)
+        bytes_of(&self.offsets) + bytes_of(&self.gaussians) + bytes_of(&self.positions)
     }
 }
 
-/// What sorting and binning need besides their results.
+/// What sorting and listing need besides their results.
 #[derive(Debug)]
 pub(crate) struct ListScratch<T: Real> {
     order: Vec<(T::Key, u32)>,
@@ -57,8 +57,8 @@ impl<T: Real> Buffers for ListScratch<T> {
 /// Puts the Gaussians that reach some tile in order of depth, ties by index.
 fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut ListScratch<T>) {
     scratch.order.clear();
-    for (chunk, (splats, cover)) in splats.chunks(CHUNK).zip(covers).enumerate() {
-        let first = (chunk * CHUNK) as u32;
+    for (packet, (splats, cover)) in splats.chunks(PACKET_SIZE).zip(covers).enumerate() {
+        let first = (packet * PACKET_SIZE) as u32;
         let reached = splats
             .iter()
             .enumerate()
@@ -70,23 +70,23 @@ fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut L
     radix_sort_with(&mut scratch.order, &mut scratch.sort);
 }
 
-/// Numbers the pairs of every chunk.
-fn number_pairs(covers: &mut [Cover]) -> Result<(), RasterError> {
+/// Numbers the intersections of every packet.
+fn number_intersections(covers: &mut [Cover]) -> Result<(), RasterError> {
     let mut total = 0u32;
     for cover in covers.iter_mut() {
         cover.number(total);
         total = u32::try_from(cover.count())
             .ok()
-            .and_then(|pairs| total.checked_add(pairs))
+            .and_then(|own| total.checked_add(own))
             .ok_or(RasterError::TooManyIntersections)?;
     }
     Ok(())
 }
 
-/// Counts the pairs of every tile.
-fn count_pairs(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
+/// Counts the intersections of every tile.
+fn count_by_tile(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
     let offsets = filled(offsets, tiles + 1, 0);
-    for &tile in covers.iter().flat_map(Cover::pairs) {
+    for &tile in covers.iter().flat_map(Cover::tiles) {
         offsets[tile as usize + 1] += 1;
     }
     let mut sum = 0;
@@ -97,26 +97,26 @@ fn count_pairs(covers: &[Cover], tiles: usize, offsets: &mut Vec<u32>) {
 }
 
 /// Sorts the projected splats by depth and lists those of every tile.
-pub(crate) fn bin_tiles<T: Real>(
+pub(crate) fn bin_splats<T: Real>(
     projected: &mut Projected<T>,
     tiles: usize,
     scratch: &mut ListScratch<T>,
-    bins: &mut TileLists,
+    lists: &mut TileLists,
 ) -> Result<(), RasterError> {
-    number_pairs(projected.covers_mut())?;
+    number_intersections(projected.covers_mut())?;
     let (splats, covers) = (&projected.splats[..], projected.covers());
     rayon::join(
         || sort_by_depth(splats, covers, scratch),
-        || count_pairs(covers, tiles, &mut bins.offsets),
+        || count_by_tile(covers, tiles, &mut lists.offsets),
     );
-    fill_bins(covers, scratch, bins);
+    fill_lists(covers, scratch, lists);
     Ok(())
 }
 
 /// The lists of all tiles while they are made.
 struct Lists<'a> {
     covers: &'a [Cover],
-    ranks: Shared<'a>,
+    gaussians: Shared<'a>,
     positions: Shared<'a>,
 }
 
@@ -124,35 +124,35 @@ impl Lists<'_> {
     /// Puts a Gaussian into the list of each tile that it reaches, where `place` says.
     #[inline(always)]
     fn put(&self, i: u32, mut place: impl FnMut(u32) -> u32) {
-        let (cover, local) = (&self.covers[i as usize / CHUNK], i as usize % CHUNK);
-        for (own, &tile) in cover.pairs_of(local).zip(cover.tiles_of(local)) {
+        let (cover, local) = (&self.covers[i as usize / PACKET_SIZE], i as usize % PACKET_SIZE);
+        for (own, &tile) in cover.intersections_of(local).zip(cover.tiles_of(local)) {
             let at = place(tile);
-            self.ranks.set(at as usize, i);
+            self.gaussians.set(at as usize, i);
             self.positions.set(own, at);
         }
     }
 }
 
-/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_pairs`]: the near half from the front of each
+/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_by_tile`]: the near half from the front of each
 /// list, at the same time the far half from its back.
-fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, bins: &mut TileLists) {
+fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &mut TileLists) {
     let ListScratch {
         order, fronts, backs, ..
     } = scratch;
-    let pairs = bins.offsets.last().map_or(0, |&end| end as usize);
-    let lists = Lists {
+    let intersections = lists.offsets.last().map_or(0, |&end| end as usize);
+    let out = Lists {
         covers,
-        ranks: Shared::new(stale(&mut bins.ranks, pairs)),
-        positions: Shared::new(stale(&mut bins.positions, pairs)),
+        gaussians: Shared::new(stale(&mut lists.gaussians, intersections)),
+        positions: Shared::new(stale(&mut lists.positions, intersections)),
     };
-    fronts.clone_from(&bins.offsets);
+    fronts.clone_from(&lists.offsets);
     backs.clear();
-    backs.extend_from_slice(&bins.offsets[1..]);
+    backs.extend_from_slice(&lists.offsets[1..]);
     let (near, far) = order.split_at(order.len() / 2);
     rayon::join(
         || {
             for &(_, i) in near {
-                lists.put(i, |tile| {
+                out.put(i, |tile| {
                     let next = &mut fronts[tile as usize];
                     *next += 1;
                     *next - 1
@@ -161,7 +161,7 @@ fn fill_bins<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, bins: &mut
         },
         || {
             for &(_, i) in far.iter().rev() {
-                lists.put(i, |tile| {
+                out.put(i, |tile| {
                     let last = &mut backs[tile as usize];
                     *last -= 1;
                     *last

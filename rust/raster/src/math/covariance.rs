@@ -120,11 +120,11 @@ pub(crate) struct Whitening<T> {
     pub(crate) tilt: T,
     /// √(det A Aᵀ / det Σ): what `antialiased` scales opacity by.
     pub(crate) compensation: T,
-    /// Σ is neither singular nor beyond the numbers; if it is, nothing else here means anything.
+    /// Whether Σ is neither singular nor out of range; if not, the other fields are of no meaning.
     pub(crate) sound: bool,
 }
 
-/// A and Σ in units that keep a determinant, a fourth power, within range.
+/// A and Σ in units that keep the determinant, which is a fourth power of lengths, within range.
 struct Scaled<T> {
     /// One unit is 1/`unit` pixels.
     unit: T,

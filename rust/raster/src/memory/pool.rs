@@ -32,7 +32,7 @@ static IDLE: Mutex<Idle> = Mutex::new(Idle {
 });
 
 fn idle() -> MutexGuard<'static, Idle> {
-    // What a panic elsewhere left behind is whole: every change below is made in one go.
+    // A panic elsewhere cannot leave this half changed, so a poisoned lock is as good as a sound one.
     IDLE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -111,7 +111,7 @@ pub(crate) fn bytes_of<U>(buffer: &Vec<U>) -> usize {
 /// A buffer of `len` elements whose old contents may still be there: for one that is overwritten whole.
 pub(crate) fn stale<U: Copy + Default>(buffer: &mut Vec<U>, len: usize) -> &mut [U] {
     if buffer.len() < len {
-        // Growing by copying would carry the old contents along for nothing.
+        // Cleared first, so that growing copies nothing.
         buffer.clear();
     }
     buffer.resize(len, U::default());

@@ -1,4 +1,4 @@
-//! Numbers that several threads write, each in places of its own.
+//! Slices of integers that several threads write, each in places of its own.
 #![allow(unsafe_code)]
 
 use std::sync::atomic::{AtomicU32, Ordering};

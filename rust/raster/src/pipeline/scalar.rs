@@ -16,7 +16,7 @@ use crate::error::RasterError;
 use crate::input::camera::Camera;
 use crate::input::gaussians::Gaussians;
 use crate::input::settings::Limits;
-use crate::lists::tile_lists::{ListScratch, TileLists, bin_tiles};
+use crate::lists::tile_lists::{ListScratch, TileLists, bin_splats};
 use crate::memory::pool::Pooled;
 use crate::project::projected::Projected;
 use crate::project::splat::ScreenInfo;
@@ -40,7 +40,7 @@ pub trait Scalar: Vectors {
         projected: &mut Projected<Self>,
         tiles: usize,
         scratch: &mut ListScratch<Self>,
-        bins: &mut TileLists,
+        lists: &mut TileLists,
     ) -> Result<(), RasterError>;
     fn composite(scene: &Scene<'_, Self>, colors: &mut [Self], alphas: &mut [Self]) -> Pooled<Canvas<Self>>;
     fn composite_vjp(
@@ -55,9 +55,9 @@ pub trait Scalar: Vectors {
         camera: &Camera<Self>,
         limits: &Limits<Self>,
         projected: &Projected<Self>,
-        bins: &TileLists,
+        lists: &TileLists,
         channels: Channels<'_, Self>,
-        slots: &[Self],
+        intersections: &[Self],
         out: ViewGradients<'_, Self>,
     );
     fn harmonics(harmonics: &HarmonicSums<'_, Self>) -> Vec<[Self; 3]>;
@@ -88,9 +88,9 @@ macro_rules! scalar {
                 projected: &mut Projected<Self>,
                 tiles: usize,
                 scratch: &mut ListScratch<Self>,
-                bins: &mut TileLists,
+                lists: &mut TileLists,
             ) -> Result<(), RasterError> {
-                bin_tiles(projected, tiles, scratch, bins)
+                bin_splats(projected, tiles, scratch, lists)
             }
 
             fn composite(
@@ -119,13 +119,20 @@ macro_rules! scalar {
                 camera: &Camera<Self>,
                 limits: &Limits<Self>,
                 projected: &Projected<Self>,
-                bins: &TileLists,
+                lists: &TileLists,
                 channels: Channels<'_, Self>,
-                slots: &[Self],
+                intersections: &[Self],
                 out: ViewGradients<'_, Self>,
             ) {
                 project_view_vjp(
-                    gaussians, camera, limits, projected, bins, channels, slots, out,
+                    gaussians,
+                    camera,
+                    limits,
+                    projected,
+                    lists,
+                    channels,
+                    intersections,
+                    out,
                 );
             }
 

@@ -38,7 +38,7 @@ pub(crate) struct ViewState<T: Scalar> {
     grid: TileGrid,
     limits: Limits<T>,
     projected: Pooled<Projected<T>>,
-    bins: Pooled<TileLists>,
+    lists: Pooled<TileLists>,
     canvas: Pooled<Canvas<T>>,
 }
 
@@ -51,9 +51,9 @@ impl<T: Scalar> ViewState<T> {
     pub(crate) fn median_ids(&self) -> Vec<i32> {
         let scene = Scene {
             grid: self.grid,
-            bins: &self.bins,
+            lists: &self.lists,
             splats: &self.projected.splats,
-            // Only whom light reaches is asked, not with which colour.
+            // The median depends on how light passes, not on colours.
             channels: Channels {
                 colors: &[],
                 stride: 0,
@@ -73,7 +73,7 @@ impl<T: Scalar> ViewState<T> {
     }
 
     pub(crate) fn intersections(&self) -> usize {
-        self.bins.ranks.len()
+        self.lists.gaussians.len()
     }
 
     pub(crate) fn saturated(&self) -> usize {
@@ -81,7 +81,7 @@ impl<T: Scalar> ViewState<T> {
     }
 
     pub(crate) fn empty_tiles(&self) -> usize {
-        self.bins
+        self.lists
             .offsets
             .windows(2)
             .filter(|pair| pair[0] == pair[1])
@@ -104,11 +104,11 @@ pub(crate) fn scene<'a, T: Scalar>(
     mode: RenderMode,
     limits: &'a Limits<T>,
     projected: &'a Projected<T>,
-    bins: &'a TileLists,
+    lists: &'a TileLists,
 ) -> Scene<'a, T> {
     Scene {
         grid: TileGrid::new(view.camera.width, view.camera.height, limits.tile_size),
-        bins,
+        lists,
         splats: &projected.splats,
         channels: channels_of(&view.gaussians, mode),
         expected_depth: mode.expects_depth(),
@@ -139,7 +139,7 @@ pub(crate) fn render_view<T: Scalar>(
 ) -> Result<ViewState<T>, RasterError> {
     let grid = TileGrid::new(view.camera.width, view.camera.height, limits.tile_size);
     let wanted = view.pixel_mask.map(|mask| wanted_tiles(mask, &grid));
-    let (mut projected, mut bins) = (Pooled::take(), Pooled::take());
+    let (mut projected, mut lists) = (Pooled::take(), Pooled::take());
     T::project(
         &mut projected,
         &view.gaussians,
@@ -149,14 +149,14 @@ pub(crate) fn render_view<T: Scalar>(
         wanted.as_deref(),
         image.screen,
     );
-    T::bin(&mut projected, grid.len(), &mut Pooled::take(), &mut bins)?;
-    let scene = scene(view, mode, limits, &projected, &bins);
+    T::bin(&mut projected, grid.len(), &mut Pooled::take(), &mut lists)?;
+    let scene = scene(view, mode, limits, &projected, &lists);
     let canvas = T::composite(&scene, image.colors, image.alphas);
     Ok(ViewState {
         grid,
         limits: *limits,
         projected,
-        bins,
+        lists,
         canvas,
     })
 }
@@ -170,7 +170,7 @@ pub(crate) fn render_view_vjp<T: Scalar>(
     v: Cotangents<'_, T>,
     out: ViewGradients<'_, T>,
 ) -> usize {
-    let scene = scene(view, mode, limits, &state.projected, &state.bins);
+    let scene = scene(view, mode, limits, &state.projected, &state.lists);
     let gradients = T::composite_vjp(&scene, &state.canvas, v, !out.absgrad.is_empty());
     for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
         *sum += v;
@@ -180,9 +180,9 @@ pub(crate) fn render_view_vjp<T: Scalar>(
         &view.camera,
         limits,
         &state.projected,
-        &state.bins,
+        &state.lists,
         scene.channels,
-        gradients.slots.written(),
+        gradients.intersections.written(),
         out,
     );
     gradients.tiles_skipped

@@ -1,30 +1,29 @@
-//! Projection and its vjp for many Gaussians at once.
+//! Projection and its vjp for a packet of Gaussians at once.
 //!
-//! A chunk is transposed into columns, one per number, so that the loops over its Gaussians vectorise; `levels`
-//! compiles them once per CPU feature level. Chunks are the unit of parallel work. Their size is fixed, so that sums over
-//! chunks do not depend on the number of threads.
+//! A packet is transposed into columns, one per number, so that the loops over its Gaussians vectorise. Packets are the
+//! unit of parallel work. Their size is fixed, so that sums over packets do not depend on the number of threads.
 
 use crate::input::gaussians::Gaussians;
 use crate::math::real::Real;
-use crate::project::splat::{Lens, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
+use crate::project::splat::{Projection, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
 use crate::project::tiles::{Cover, Cutter, Ellipse, TileGrid, padded_reach, pixel_range};
 
-/// Gaussians in a chunk.
-pub(crate) const CHUNK: usize = 256;
-/// Loops run over whole vectors; what is left over in a column is ignored.
+/// Gaussians in a packet.
+pub(crate) const PACKET_SIZE: usize = 256;
+/// Loops run over whole vectors, the last of which may reach beyond the packet's Gaussians.
 const LANES: usize = 16;
 
 /// Radii up to this many pixels are rounded in columns.
 const MOST_EXACT: f64 = 4e6;
 
-type Column<U> = [U; CHUNK];
+type Column<U> = [U; PACKET_SIZE];
 
-/// The Gaussians of a chunk: mean, quaternion, scale, opacity.
+/// The Gaussians of a packet: mean, quaternion, scale, opacity.
 struct Columns<T>([Column<T>; 11]);
 
 impl<T: Real> Columns<T> {
     fn new() -> Self {
-        Self([[T::ZERO; CHUNK]; 11])
+        Self([[T::ZERO; PACKET_SIZE]; 11])
     }
 
     #[inline(always)]
@@ -57,12 +56,12 @@ impl<T: Real> Columns<T> {
 /// Lanes to run for so many Gaussians.
 #[inline(always)]
 fn whole_vectors(len: usize) -> usize {
-    len.next_multiple_of(LANES).min(CHUNK)
+    len.next_multiple_of(LANES).min(PACKET_SIZE)
 }
 
-/// Where the splats of a chunk go.
-pub(crate) struct ChunkSplats<'a, T> {
-    /// By Gaussian; anything for one that no pixel sees.
+/// Where the splats of a packet go.
+pub(crate) struct PacketSplats<'a, T> {
+    /// By Gaussian; of no meaning for one that no pixel sees.
     pub(crate) splats: &'a mut [Splat<T>],
     pub(crate) screen: ScreenInfo<'a, T>,
     pub(crate) cover: &'a mut Cover,
@@ -70,31 +69,31 @@ pub(crate) struct ChunkSplats<'a, T> {
 
 /// Projects the Gaussians from `first` on and finds the tiles that each reaches.
 #[inline(always)]
-pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
+pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     gaussians: &Gaussians<'_, T>,
     first: usize,
-    lens: &Lens<T>,
+    projection: &Projection<T>,
     grid: &TileGrid,
     wanted: Option<&[bool]>,
-    out: ChunkSplats<'_, T>,
+    out: PacketSplats<'_, T>,
 ) {
     let len = out.splats.len();
-    let lens = *lens;
+    let projection = *projection;
     let mut columns = Columns::new();
-    for lane in 0..len.min(CHUNK) {
+    for lane in 0..len.min(PACKET_SIZE) {
         columns.set(lane, gaussians, first + lane);
     }
-    let zero = [T::ZERO; CHUNK];
+    let zero = [T::ZERO; PACKET_SIZE];
     let [mut xs, mut ys, mut depths, mut log_opacities, mut reaches] = [zero; 5];
     let [mut w11s, mut w12s, mut w22s, mut rxs, mut rys] = [zero; 5];
     let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
-    let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; CHUNK]; 5];
+    let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; PACKET_SIZE]; 5];
     let (height, most) = (T::of(grid.height as f64), T::of(MOST_EXACT));
     // Tile sizes are powers of two; a division would cost more than all the rest.
     let shift = grid.tile_size.trailing_zeros();
     for lane in 0..whole_vectors(len) {
         let (mean, quat, scale, opacity) = columns.get(lane);
-        let o = splat::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity);
+        let o = splat::<T, ANTIALIASED>(&projection, mean, quat, scale, opacity);
         let s = &o.splat;
         (xs[lane], ys[lane], depths[lane]) = (s.x, s.y, s.depth);
         (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
@@ -130,7 +129,7 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
     out.cover.clear(len);
     out.cover.visible = 0;
     let mut cutter = Cutter::new(grid, wanted);
-    for lane in 0..len.min(CHUNK) {
+    for lane in 0..len.min(PACKET_SIZE) {
         if seen[lane] == 0 {
             (means2d[lane], camera_zs[lane], radii[lane]) = ([T::ZERO; 2], T::ZERO, [0; 2]);
             continue;
@@ -151,7 +150,7 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
         camera_zs[lane] = depth;
         radii[lane] = [ceil_xs[lane] as i32, ceil_ys[lane] as i32];
         if rxs[lane].greater(rys[lane]) >= most {
-            // The cast saturates, so an unbounded Gaussian gets the largest integer.
+            // The cast saturates: a Gaussian without bounds gets the largest integer.
             radii[lane] = [rxs[lane], rys[lane]].map(|r| r.as_f64().ceil() as i32);
         }
         let ellipse = Ellipse {
@@ -170,32 +169,32 @@ pub(crate) fn project_chunk<T: Real, const ANTIALIASED: bool>(
     out.cover.finish();
 }
 
-/// Gradients of the splats of a chunk, packed: lane by lane those of the Gaussians that have any.
-pub(crate) struct ChunkGradients<T> {
-    /// Which Gaussian of the chunk is in each lane.
+/// Gradients of the splats of a packet, packed: lane by lane those of the Gaussians that have any.
+pub(crate) struct PacketGradients<T> {
+    /// Which Gaussian of the packet is in each lane.
     locals: Column<u32>,
     /// How many.
     pub(crate) len: usize,
     /// h; hu, hv; huu, huv, hvv; camera z.
     moments: [Column<T>; 7],
-    /// Of the Gaussians: mean, quaternion, scale, opacity; filled by [`vjp_chunk`].
+    /// Of the Gaussians: mean, quaternion, scale, opacity; filled by [`packet_vjp`].
     gaussians: [Column<T>; 11],
-    /// Of the camera, summed over the chunk, if asked for.
+    /// Of the camera, summed over the packet, if asked for.
     pub(crate) viewmat: [[T; 4]; 3],
 }
 
-impl<T: Real> ChunkGradients<T> {
+impl<T: Real> PacketGradients<T> {
     pub(crate) fn new() -> Self {
         Self {
-            locals: [0; CHUNK],
+            locals: [0; PACKET_SIZE],
             len: 0,
-            moments: [[T::ZERO; CHUNK]; 7],
-            gaussians: [[T::ZERO; CHUNK]; 11],
+            moments: [[T::ZERO; PACKET_SIZE]; 7],
+            gaussians: [[T::ZERO; PACKET_SIZE]; 11],
             viewmat: [[T::ZERO; 4]; 3],
         }
     }
 
-    /// Adds a Gaussian of the chunk with the gradients of its splat, unless all are zero.
+    /// Adds a Gaussian of the packet with the gradients of its splat, unless all are zero.
     #[inline(always)]
     pub(crate) fn push(&mut self, local: usize, moments: [T; 7]) {
         if moments == [T::ZERO; 7] {
@@ -209,7 +208,7 @@ impl<T: Real> ChunkGradients<T> {
         self.len += 1;
     }
 
-    /// Adds the gradients of the Gaussians to those of the chunk; an empty slice is one that nobody asked for.
+    /// Adds the gradients of the Gaussians to those of the packet; an empty slice is one that nobody asked for.
     #[inline(always)]
     pub(crate) fn add_to(
         &self,
@@ -218,7 +217,7 @@ impl<T: Real> ChunkGradients<T> {
         scales: &mut [[T; 3]],
         opacities: &mut [T],
     ) {
-        let locals = &self.locals[..self.len.min(CHUNK)];
+        let locals = &self.locals[..self.len.min(PACKET_SIZE)];
         let [m0, m1, m2, q0, q1, q2, q3, s0, s1, s2, o] = &self.gaussians;
         add(locals, [m0, m1, m2], means);
         add(locals, [q0, q1, q2, q3], quats);
@@ -250,24 +249,24 @@ pub(crate) fn is_sound<T: Real, const N: usize>(values: [T; N]) -> bool {
     sum == T::ZERO
 }
 
-/// The vjp of [`project_chunk`], from splats to Gaussians and camera. A Gaussian whose gradient is beyond the scalar's
-/// range has none, and gives the camera none: one that stands on the camera must not spoil the camera's gradient, nor
-/// an optimiser's averages.
+/// The vjp of [`project_packet`], from splats to Gaussians and camera. A Gaussian whose gradient is beyond the scalar's
+/// range, such as one at the camera's very place, has the gradient 0 and adds none to the camera's: an infinite one would
+/// spoil the camera's gradient and an optimiser's averages.
 #[inline(always)]
-pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
+pub(crate) fn packet_vjp<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
     gaussians: &Gaussians<'_, T>,
     first: usize,
-    lens: &Lens<T>,
-    chunk: &mut ChunkGradients<T>,
+    projection: &Projection<T>,
+    packet: &mut PacketGradients<T>,
 ) {
-    let lens = *lens;
-    let len = chunk.len.min(CHUNK);
+    let projection = *projection;
+    let len = packet.len.min(PACKET_SIZE);
     let mut columns = Columns::new();
     for lane in 0..len {
-        columns.set(lane, gaussians, first + chunk.locals[lane] as usize);
+        columns.set(lane, gaussians, first + packet.locals[lane] as usize);
     }
-    let mut viewmats = [[T::ZERO; CHUNK]; 12];
-    let (moments, out) = (&chunk.moments, &mut chunk.gaussians);
+    let mut viewmats = [[T::ZERO; PACKET_SIZE]; 12];
+    let (moments, out) = (&packet.moments, &mut packet.gaussians);
     for lane in 0..whole_vectors(len) {
         let (mean, quat, scale, opacity) = columns.get(lane);
         let m = |k: usize| moments[k][lane];
@@ -278,8 +277,8 @@ pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
             second: [huu, huv, hvv],
             depth,
         };
-        let v = splat_vjp::<T, ANTIALIASED>(&lens, mean, quat, scale, opacity, &v);
-        // NaN that came in stays, so that it is noticed.
+        let v = splat_vjp::<T, ANTIALIASED>(&projection, mean, quat, scale, opacity, &v);
+        // NaN in the incoming gradient is passed on, so that the caller notices it.
         let poisoned = !is_sound([h, hu, hv, huu, huv, hvv, depth]);
         let ([m0, m1, m2], [q0, q1, q2, q3], [s0, s1, s2]) = (v.mean, v.quat, v.scale);
         let own = [m0, m1, m2, q0, q1, q2, q3, s0, s1, s2, v.opacity];
@@ -296,7 +295,7 @@ pub(crate) fn vjp_chunk<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
         }
     }
     if CAMERA {
-        for (sum, column) in chunk.viewmat.as_flattened_mut().iter_mut().zip(&viewmats) {
+        for (sum, column) in packet.viewmat.as_flattened_mut().iter_mut().zip(&viewmats) {
             *sum = column[..len].iter().copied().sum();
         }
     }

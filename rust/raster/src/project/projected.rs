@@ -10,21 +10,20 @@ use crate::input::settings::Limits;
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, bytes_of, stale};
 use crate::project::dispatch;
-use crate::project::packet::{CHUNK, ChunkSplats};
-use crate::project::splat::{Lens, ScreenInfo, Splat};
+use crate::project::packet::{PACKET_SIZE, PacketSplats};
+use crate::project::splat::{Projection, ScreenInfo, Splat};
 use crate::project::tiles::{Cover, TileGrid};
-use crate::simd::level::SimdLevel;
 
-/// (Gaussian, tile) pairs that are listed while projecting. With more, the rest is first only counted: should they be
-/// more than can be numbered, that is to be said before they fill the memory.
-const PATIENCE: usize = 1 << 26;
+/// Intersections that are listed while projecting. Beyond this many they are first only counted, because a call that has
+/// more than can be numbered must fail before their list fills the memory.
+const LISTED_AT_ONCE: usize = 1 << 26;
 
 /// A view's splats and which tiles each reaches.
 #[derive(Debug)]
 pub(crate) struct Projected<T> {
-    /// By Gaussian; anything for one that no pixel sees.
+    /// By Gaussian; of no meaning for one that no pixel sees.
     pub(crate) splats: Vec<Splat<T>>,
-    /// By chunk of Gaussians.
+    /// By packet of Gaussians.
     covers: Vec<Cover>,
 }
 
@@ -45,11 +44,11 @@ impl<T: Real> Buffers for Projected<T> {
 
 impl<T: Real> Projected<T> {
     pub(crate) fn covers(&self) -> &[Cover] {
-        &self.covers[..self.splats.len().div_ceil(CHUNK)]
+        &self.covers[..self.splats.len().div_ceil(PACKET_SIZE)]
     }
 
     pub(crate) fn covers_mut(&mut self) -> &mut [Cover] {
-        &mut self.covers[..self.splats.len().div_ceil(CHUNK)]
+        &mut self.covers[..self.splats.len().div_ceil(PACKET_SIZE)]
     }
 
     /// Projects the Gaussians of a view and finds the tiles that each reaches.
@@ -63,44 +62,52 @@ impl<T: Real> Projected<T> {
         screen: ScreenInfo<'_, T>,
     ) {
         let n = gaussians.len();
-        let chunks = n.div_ceil(CHUNK);
-        if self.covers.len() < chunks {
-            self.covers.resize_with(chunks, Cover::default);
+        let packets = n.div_ceil(PACKET_SIZE);
+        if self.covers.len() < packets {
+            self.covers.resize_with(packets, Cover::default);
         }
-        let (lens, level) = (Lens::new(camera, limits), SimdLevel::detect());
+        let (projection, level) = (Projection::new(camera, limits), limits.level);
         let ScreenInfo {
             means2d,
             depths,
             radii,
         } = screen;
-        for patience in [PATIENCE, usize::MAX] {
-            let pairs = AtomicUsize::new(0);
+        for limit in [LISTED_AT_ONCE, usize::MAX] {
+            let intersections = AtomicUsize::new(0);
             (
-                stale(&mut self.splats, n).par_chunks_mut(CHUNK),
-                self.covers[..chunks].par_iter_mut(),
-                means2d.par_chunks_mut(CHUNK),
-                depths.par_chunks_mut(CHUNK),
-                radii.par_chunks_mut(CHUNK),
+                stale(&mut self.splats, n).par_chunks_mut(PACKET_SIZE),
+                self.covers[..packets].par_iter_mut(),
+                means2d.par_chunks_mut(PACKET_SIZE),
+                depths.par_chunks_mut(PACKET_SIZE),
+                radii.par_chunks_mut(PACKET_SIZE),
             )
                 .into_par_iter()
                 .enumerate()
-                .for_each(|(chunk, (splats, cover, means2d, depths, radii))| {
-                    cover.counting = pairs.load(Ordering::Relaxed) > patience;
+                .for_each(|(packet, (splats, cover, means2d, depths, radii))| {
+                    cover.counting = intersections.load(Ordering::Relaxed) > limit;
                     let screen = ScreenInfo {
                         means2d,
                         depths,
                         radii,
                     };
-                    let out = ChunkSplats {
+                    let out = PacketSplats {
                         splats,
                         screen,
                         cover: &mut *cover,
                     };
-                    dispatch::project(level, gaussians, chunk * CHUNK, &lens, grid, wanted, out);
-                    pairs.fetch_add(cover.count(), Ordering::Relaxed);
+                    dispatch::project(
+                        level,
+                        gaussians,
+                        packet * PACKET_SIZE,
+                        &projection,
+                        grid,
+                        wanted,
+                        out,
+                    );
+                    intersections.fetch_add(cover.count(), Ordering::Relaxed);
                 });
-            let pairs = pairs.into_inner();
-            if pairs <= patience || u32::try_from(pairs).is_err() {
+            let intersections = intersections.into_inner();
+            if intersections <= limit || u32::try_from(intersections).is_err() {
                 break;
             }
         }

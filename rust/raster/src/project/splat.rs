@@ -1,6 +1,6 @@
 //! One Gaussian to one splat on the screen (EWA), and back for gradients.
 //!
-//! Everything here is free of branches that depend on the Gaussian, so that `chunk` can run it on many at once.
+//! Everything here is free of branches that depend on the Gaussian, so that `packet` can run it on many at once.
 
 use crate::input::camera::{Camera, CameraModel};
 use crate::input::settings::Limits;
@@ -14,11 +14,12 @@ use crate::math::real::Real;
 /// far outside the view the linearisation would blow a Gaussian up across the whole image.
 const FRUSTUM_MARGIN: f64 = 0.3 * 0.5;
 
-/// Standard deviations between the image's corner and a centre at which numbers are about to end.
+/// A centre this many standard deviations from the image's corner is dropped, because squares of such distances overflow
+/// `f32`.
 const UNREACHABLE: f64 = 1e30;
 
-/// Opacities below this are composited as if they were this: a logarithm needs one above 0, and what the difference makes
-/// of an image is beyond either scalar's precision. Only reached without an alpha threshold.
+/// The least opacity that is composited: smaller ones are raised to it, because 0 has no logarithm. Neither scalar can
+/// show the difference in an image. Only reached without an alpha threshold.
 const FAINTEST: f64 = 1.0 / (1u64 << 63) as f64;
 
 /// A Gaussian on the screen.
@@ -37,7 +38,7 @@ pub(crate) struct Splat<T> {
     pub(crate) depth: T,
 }
 
-/// What is told about every Gaussian, visible or not (zeros).
+/// What the caller learns about every Gaussian; zeros for those that no pixel sees.
 #[derive(Debug)]
 pub(crate) struct ScreenInfo<'a, T> {
     pub(crate) means2d: &'a mut [[T; 2]],
@@ -45,9 +46,9 @@ pub(crate) struct ScreenInfo<'a, T> {
     pub(crate) radii: &'a mut [[i32; 2]],
 }
 
-/// A camera, a view's rules and what follows from both alone.
+/// How a view projects: its camera, its settings and what follows from both.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Lens<T> {
+pub(crate) struct Projection<T> {
     camera: Camera<T>,
     limits: Limits<T>,
     perspective: bool,
@@ -58,7 +59,7 @@ pub(crate) struct Lens<T> {
     log_threshold: T,
 }
 
-impl<T: Real> Lens<T> {
+impl<T: Real> Projection<T> {
     pub(crate) fn new(camera: &Camera<T>, limits: &Limits<T>) -> Self {
         let k = &camera.k;
         let size = [T::of(camera.width as f64), T::of(camera.height as f64)];
@@ -101,8 +102,13 @@ struct Footprint<T> {
 }
 
 #[inline(always)]
-fn footprint<T: Real>(lens: &Lens<T>, mean: Vec3<T>, quat: [T; 4], scale: Vec3<T>) -> Footprint<T> {
-    let camera = &lens.camera;
+fn footprint<T: Real>(
+    projection: &Projection<T>,
+    mean: Vec3<T>,
+    quat: [T; 4],
+    scale: Vec3<T>,
+) -> Footprint<T> {
+    let camera = &projection.camera;
     let rotated = apply(&camera.rotation, mean);
     let point = three(|i| rotated[i] + camera.translation[i]);
     let (unit_quat, inverse_quat_length) = normalize_quat(quat);
@@ -113,18 +119,18 @@ fn footprint<T: Real>(lens: &Lens<T>, mean: Vec3<T>, quat: [T; 4], scale: Vec3<T
         three(|i| three(|j| r[i][0] * scaled[0][j] + r[i][1] * scaled[1][j] + r[i][2] * scaled[2][j]));
 
     let k = &camera.k;
-    let z = if lens.perspective { point[2] } else { T::ONE };
+    let z = if projection.perspective { point[2] } else { T::ONE };
     let inverse_z = T::ONE / z;
     let limit_slope = |p: T, (least, greatest): (T, T)| {
         let slope = p * inverse_z;
         let limited = slope.limit(least, greatest);
         (
-            if lens.perspective { limited } else { T::ZERO },
-            lens.perspective & (limited == slope),
+            if projection.perspective { limited } else { T::ZERO },
+            projection.perspective & (limited == slope),
         )
     };
-    let (sx, free_x) = limit_slope(point[0], lens.slopes[0]);
-    let (sy, free_y) = limit_slope(point[1], lens.slopes[1]);
+    let (sx, free_x) = limit_slope(point[0], projection.slopes[0]);
+    let (sy, free_y) = limit_slope(point[1], projection.slopes[1]);
     let (gx, gy) = (k.fx * inverse_z, k.fy * inverse_z);
     Footprint {
         point,
@@ -154,7 +160,7 @@ pub(crate) struct Outlined<T> {
     /// As in [`crate::math::covariance::Whitening`].
     pub(crate) slope: T,
     pub(crate) tilt: T,
-    /// Whether some pixel may see it; if not, nothing else here means anything.
+    /// Whether some pixel may see it; if not, the other fields are of no meaning.
     pub(crate) visible: bool,
 }
 
@@ -167,16 +173,16 @@ pub(crate) fn extent<T: Real>(reach: T) -> T {
 /// The splat of one Gaussian.
 #[inline(always)]
 pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
-    lens: &Lens<T>,
+    projection: &Projection<T>,
     mean: Vec3<T>,
     quat: [T; 4],
     scale: Vec3<T>,
     opacity: T,
 ) -> Outlined<T> {
-    let (k, limits) = (&lens.camera.k, &lens.limits);
-    let shape = footprint(lens, mean, quat, scale);
+    let (k, limits) = (&projection.camera.k, &projection.limits);
+    let shape = footprint(projection, mean, quat, scale);
     let depth = shape.point[2];
-    // Divided, not multiplied by a rounded reciprocal: a pixel position has few bits to spare.
+    // A division rounds once, a product with the reciprocal twice, and a pixel position needs every bit.
     let x = k.fx * (shape.point[0] / shape.z) + k.cx;
     let y = k.fy * (shape.point[1] / shape.z) + k.cy;
     let w = whiten(shape.rows[0], shape.rows[1], limits.eps2d);
@@ -187,17 +193,17 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     };
     let log_opacity = opacity.greater(T::of(FAINTEST)).log2();
     let reach = if limits.alpha_threshold > T::ZERO {
-        log_opacity - lens.log_threshold
+        log_opacity - projection.log_threshold
     } else {
         T::of(f64::INFINITY)
     };
     let extent = extent(reach);
     let (rx, ry) = (extent * w.deviations[0], extent * w.deviations[1]);
-    // Comparisons are written so that NaN, which finite inputs can still overflow to, is culled too.
-    // So far away that u and v overflow, it is as good as behind the camera; only reached without an alpha threshold.
+    // Finite inputs can overflow to NaN here; these comparisons are false for it, so that it is culled.
+    // The distance matters without an alpha threshold only, when nothing else limits how far a Gaussian reaches.
     let distance = (w.w11 * x).abs() + (w.w12 * y).abs() + (w.w22 * y).abs();
     let in_range = (depth > limits.near) & (depth < limits.far) & w.sound & (distance < T::of(UNREACHABLE));
-    let [width, height] = lens.size;
+    let [width, height] = projection.size;
     let on_screen = (x + rx > T::ZERO) & (x - rx < width) & (y + ry > T::ZERO) & (y - ry < height);
     // Radius 0 is a Gaussian that reaches the threshold only at its very centre.
     let clipped = (rx <= limits.radius_clip) & (ry <= limits.radius_clip) & (limits.radius_clip > T::ZERO);
@@ -245,15 +251,15 @@ pub(crate) struct GaussianGradient<T> {
 /// The vjp of [`splat`] for a visible Gaussian.
 #[inline(always)]
 pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
-    lens: &Lens<T>,
+    projection: &Projection<T>,
     mean: Vec3<T>,
     quat: [T; 4],
     scale: Vec3<T>,
     opacity: T,
     v: &SplatGradient<T>,
 ) -> GaussianGradient<T> {
-    let (camera, eps) = (&lens.camera, lens.limits.eps2d);
-    let shape = footprint(lens, mean, quat, scale);
+    let (camera, eps) = (&projection.camera, projection.limits.eps2d);
+    let shape = footprint(projection, mean, quat, scale);
     let w = whiten(shape.rows[0], shape.rows[1], eps);
     let compensation = if ANTIALIASED { w.compensation } else { T::ONE };
 
@@ -288,7 +294,7 @@ pub(crate) fn splat_vjp<T: Real, const ANTIALIASED: bool>(
     let v_point = [
         v_sx * shape.inverse_z,
         v_sy * shape.inverse_z,
-        v.depth - held(lens.perspective, shape.inverse_z * nearer),
+        v.depth - held(projection.perspective, shape.inverse_z * nearer),
     ];
 
     // shape = R · axes · diag(scale)

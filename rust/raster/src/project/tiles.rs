@@ -42,7 +42,8 @@ impl TileGrid {
     }
 }
 
-/// A little more than `reach`: culling must never drop a pair that the compositor, rounding differently, would keep.
+/// A little more than `reach`, because culling must keep every pixel that the compositor, which rounds differently, may
+/// find inside.
 #[inline(always)]
 pub(crate) fn padded_reach<T: Real>(reach: T) -> T {
     reach * T::of(1.001) + T::of(0.01)
@@ -58,7 +59,7 @@ pub(crate) fn pixel_range<T: Real>(low: T, high: T, pixels: T) -> (u32, u32) {
     (first, past)
 }
 
-/// Rows of tiles waiting to be cut out of ellipses together.
+/// Rows of tiles that are cut together.
 const ROWS: usize = 64;
 type Column<U> = [U; ROWS];
 
@@ -84,7 +85,7 @@ pub(crate) struct Cutter<'a, T> {
     wanted: Option<&'a [bool]>,
     ellipses: [Column<T>; 8],
     rows: Column<u32>,
-    /// Whose row it is.
+    /// Which Gaussian each row belongs to.
     owners: Column<u32>,
     used: usize,
 }
@@ -135,7 +136,7 @@ impl<'a, T: Real> Cutter<'a, T> {
         }
     }
 
-    /// Lists the tiles of the rows that wait.
+    /// Lists the tiles of the rows pushed since the last flush.
     #[inline(always)]
     pub(crate) fn flush(&mut self, cover: &mut Cover) {
         let (mut firsts, mut counts) = ([0u32; ROWS], [0u32; ROWS]);
@@ -173,19 +174,19 @@ impl<'a, T: Real> Cutter<'a, T> {
     }
 }
 
-/// Which tiles a chunk of Gaussians reaches.
+/// Which tiles a packet of Gaussians reaches.
 #[derive(Debug, Default)]
 pub(crate) struct Cover {
-    /// Gaussian by Gaussian; what lies behind `end` is to be overwritten.
+    /// Gaussian by Gaussian; beyond `end` of no meaning.
     tiles: Vec<u32>,
     end: usize,
-    /// Whether pairs are only counted, in `end`: there are too many to list before their number is known.
+    /// Whether intersections are only counted, in `end`, and not listed.
     pub(crate) counting: bool,
-    /// Where in `tiles` those of each Gaussian of the chunk begin, and where the last end.
+    /// Where in `tiles` those of each Gaussian of the packet begin, and where the last end.
     begins: Vec<u32>,
-    /// Gaussians of the chunk that some pixel may see.
+    /// Gaussians of the packet that some pixel may see.
     pub(crate) visible: usize,
-    /// (Gaussian, tile) pairs of all chunks before this one.
+    /// Intersections of all packets before this one.
     base: u32,
 }
 
@@ -194,7 +195,7 @@ impl Cover {
         bytes_of(&self.tiles) + bytes_of(&self.begins)
     }
 
-    /// Gaussians in the chunk.
+    /// Gaussians in the packet.
     pub(crate) fn len(&self) -> usize {
         self.begins.len() - 1
     }
@@ -208,7 +209,7 @@ impl Cover {
     /// Adds consecutive tiles to those of a Gaussian, which must not come before those added earlier.
     #[inline(always)]
     fn push(&mut self, owner: usize, first: u32, count: u32, wanted: Option<&[bool]>) {
-        /// Tiles written at once, needed or not: how many are is hard for a branch to predict.
+        /// Tiles written at once, needed or not. Their number varies too much for a branch to predict.
         const AT_ONCE: usize = 8;
         if self.counting {
             let tiles = first as usize..(first + count) as usize;
@@ -246,17 +247,17 @@ impl Cover {
         }
     }
 
-    /// How many (Gaussian, tile) pairs, listed or not.
+    /// How many intersections, listed or not.
     pub(crate) fn count(&self) -> usize {
         self.end
     }
 
-    /// (Gaussian, tile) pairs of the chunk.
-    pub(crate) fn pairs(&self) -> &[u32] {
+    /// The tile of each intersection of the packet.
+    pub(crate) fn tiles(&self) -> &[u32] {
         &self.tiles[..self.end]
     }
 
-    /// Whether a Gaussian of the chunk reaches any tile.
+    /// Whether a Gaussian of the packet reaches any tile.
     #[inline(always)]
     pub(crate) fn reaches(&self, local: usize) -> bool {
         self.begins[local] < self.begins[local + 1]
@@ -266,14 +267,14 @@ impl Cover {
         &self.tiles[self.begins[local] as usize..self.begins[local + 1] as usize]
     }
 
-    /// Numbers the chunk's pairs from `base` on.
+    /// Numbers the packet's intersections from `base` on.
     pub(crate) fn number(&mut self, base: u32) {
         self.base = base;
     }
 
     /// Where a Gaussian's own part of [`crate::lists::tile_lists::TileLists::positions`] is.
     #[inline(always)]
-    pub(crate) fn pairs_of(&self, local: usize) -> std::ops::Range<usize> {
+    pub(crate) fn intersections_of(&self, local: usize) -> std::ops::Range<usize> {
         (self.base + self.begins[local]) as usize..(self.base + self.begins[local + 1]) as usize
     }
 }

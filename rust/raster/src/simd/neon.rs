@@ -3,6 +3,7 @@
 
 use std::arch::aarch64::*;
 
+use crate::simd::level::{Simd, Work};
 use crate::simd::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 /// Calls an intrinsic that touches no memory.
@@ -13,29 +14,54 @@ macro_rules! op {
     };
 }
 
+/// NEON, which every 64-bit ARM has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Neon(());
+
+impl Neon {
+    /// Part of the target.
+    pub(crate) fn guaranteed() -> Self {
+        Self(())
+    }
+}
+
+impl Simd for Neon {
+    type F32 = F32x4;
+    type F64 = F64x2;
+
+    #[inline(always)]
+    fn run<W: Work>(self, work: W) -> W::Output {
+        work.run(self)
+    }
+}
+
 macro_rules! neon {
     ($Name:ident, $V:ty, $T:ty, $Mask:ty, $lanes:literal, $dup:ident, $ld:ident, $st:ident, $add:ident, $sub:ident, $mul:ident,
      $div:ident, $fma:ident, $fms:ident, $neg:ident, $min:ident, $max:ident, $ge:ident, $gt:ident, $and:ident, $bsl:ident,
      $sum:ident, $coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident,
      $from_int:ident, $shift:ident, $add_int:ident) => {
         #[derive(Clone, Copy)]
-        #[allow(unreachable_pub)]
-        pub struct $Name($V);
+        pub(crate) struct $Name($V);
 
         impl Vector for $Name {
             type Scalar = $T;
+            type Level = Neon;
             type Mask = $Mask;
             const LANES: usize = $lanes;
 
             #[inline(always)]
-            fn splat(value: $T) -> Self {
+            fn splat(_: Neon, value: $T) -> Self {
                 Self(op!($dup(value)))
             }
             #[inline(always)]
-            fn load(values: &[$T]) -> Self {
+            fn load(_: Neon, values: &[$T]) -> Self {
                 let values = &values[..$lanes];
                 // SAFETY: the slice holds LANES values.
                 Self(unsafe { $ld(values.as_ptr()) })
+            }
+            #[inline(always)]
+            fn level(self) -> Neon {
+                Neon(())
             }
             #[inline(always)]
             fn store(self, values: &mut [$T]) {
@@ -86,8 +112,8 @@ macro_rules! neon {
             #[inline(always)]
             fn exp2<const DEGREE: usize>(self) -> Self {
                 // Adding 1.5 · 2^mantissa rounds to an integer and leaves it in the low bits.
-                let magic = Self::splat($magic);
-                let clipped = self.max(Self::splat($lowest));
+                let magic = Self(op!($dup($magic)));
+                let clipped = self.max(Self(op!($dup($lowest))));
                 let shifted = clipped.plus(magic);
                 let power = polynomial(clipped.minus(shifted.minus(magic)), $coefficients);
                 Self(op!($from_int($add_int(
@@ -123,7 +149,7 @@ macro_rules! neon {
             }
             #[inline(always)]
             fn keep(self, mask: $Mask) -> Self {
-                self.select(mask, Self::splat(0.0))
+                self.select(mask, Self(op!($dup(0.0))))
             }
             #[inline(always)]
             fn sums<const N: usize>(vectors: &[Self; N]) -> [$T; MAX_SUMS] {

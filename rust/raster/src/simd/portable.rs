@@ -1,10 +1,31 @@
 //! Arrays of four floats, for targets without a vector type of their own, and for tests of the others.
 
+use crate::simd::level::{Simd, Work};
 use crate::simd::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
+/// No vector instructions at all.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Portable(());
+
+impl Portable {
+    /// Every machine has this.
+    pub(crate) fn guaranteed() -> Self {
+        Self(())
+    }
+}
+
+impl Simd for Portable {
+    type F32 = Array<f32>;
+    type F64 = Array<f64>;
+
+    #[inline(always)]
+    fn run<W: Work>(self, work: W) -> W::Output {
+        work.run(self)
+    }
+}
+
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct Array<T>([T; 4]);
+pub(crate) struct Array<T>([T; 4]);
 
 macro_rules! array {
     ($T:ty, $Bits:ty, $coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal) => {
@@ -17,16 +38,21 @@ macro_rules! array {
 
         impl Vector for Array<$T> {
             type Scalar = $T;
+            type Level = Portable;
             type Mask = [bool; 4];
             const LANES: usize = 4;
 
             #[inline(always)]
-            fn splat(value: $T) -> Self {
+            fn splat(_: Portable, value: $T) -> Self {
                 Self([value; 4])
             }
             #[inline(always)]
-            fn load(values: &[$T]) -> Self {
+            fn load(_: Portable, values: &[$T]) -> Self {
                 Self([values[0], values[1], values[2], values[3]])
+            }
+            #[inline(always)]
+            fn level(self) -> Portable {
+                Portable(())
             }
             #[inline(always)]
             fn store(self, values: &mut [$T]) {
@@ -62,7 +88,7 @@ macro_rules! array {
             }
             #[inline(always)]
             fn minus_times_minus(self, a: Self, b: Self) -> Self {
-                Self::splat(0.0).minus(self.times(a).plus(b))
+                Self([0.0; 4]).minus(self.times(a).plus(b))
             }
             #[inline(always)]
             fn min(self, other: Self) -> Self {
@@ -75,8 +101,8 @@ macro_rules! array {
             #[inline(always)]
             fn exp2<const DEGREE: usize>(self) -> Self {
                 // Adding 1.5 · 2^mantissa rounds to an integer and leaves it in the low bits.
-                let magic = Self::splat($magic);
-                let clipped = self.max(Self::splat($lowest));
+                let magic = Self([$magic; 4]);
+                let clipped = self.max(Self([$lowest; 4]));
                 let shifted = clipped.plus(magic);
                 let power = polynomial(clipped.minus(shifted.minus(magic)), $coefficients);
                 power.map2(shifted, |p, s| {
@@ -105,7 +131,7 @@ macro_rules! array {
             }
             #[inline(always)]
             fn keep(self, mask: [bool; 4]) -> Self {
-                self.select(mask, Self::splat(0.0))
+                self.select(mask, Self([0.0; 4]))
             }
             #[inline(always)]
             fn sums<const N: usize>(vectors: &[Self; N]) -> [$T; MAX_SUMS] {

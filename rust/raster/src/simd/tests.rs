@@ -1,33 +1,32 @@
 //! Every vector type of this machine against plain floats.
 
-use super::portable::Array;
+use super::bits::transpose_bits_one_by_one;
+use super::portable::Portable;
 use super::*;
+use crate::simd::level::{SimdLevel, Work};
 use crate::simd::vector::*;
 
-/// Calls a generic function with every vector type that this machine has.
+/// Calls a generic function with the vectors of every level that this machine has, and with the portable ones.
 macro_rules! for_all_vectors {
     ($check:ident) => {
-        $check::<Array<f32>>();
-        $check::<Array<f64>>();
-        $check::<<f32 as Vectors>::Baseline>();
-        $check::<<f64 as Vectors>::Baseline>();
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                $check::<<f32 as Vectors>::Avx2>();
-                $check::<<f64 as Vectors>::Avx2>();
+        struct Check;
+        impl Work for Check {
+            type Output = ();
+            fn run<S: Simd>(self, simd: S) {
+                $check::<S::F32>(simd);
+                $check::<S::F64>(simd);
             }
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") {
-                $check::<<f32 as Vectors>::Avx512>();
-                $check::<<f64 as Vectors>::Avx512>();
-            }
+        }
+        Portable::guaranteed().run(Check);
+        for level in SimdLevel::available() {
+            level.run(Check);
         }
     };
 }
 
-fn vector<V: Vector>(value: impl Fn(usize) -> f64) -> V {
+fn vector<V: Vector>(level: V::Level, value: impl Fn(usize) -> f64) -> V {
     let values: Vec<V::Scalar> = (0..V::LANES).map(|i| V::Scalar::of(value(i))).collect();
-    V::load(&values)
+    V::load(level, &values)
 }
 
 fn lanes<V: Vector>(v: V) -> Vec<f64> {
@@ -45,10 +44,10 @@ fn epsilon<V: Vector>() -> f64 {
     }
 }
 
-fn arithmetic<V: Vector>() {
-    let a = vector::<V>(|i| i as f64 + 1.0);
-    let b = vector::<V>(|i| 3.0 - i as f64 * 0.5);
-    let c = V::splat(V::Scalar::of(0.25));
+fn arithmetic<V: Vector>(level: V::Level) {
+    let a = vector::<V>(level, |i| i as f64 + 1.0);
+    let b = vector::<V>(level, |i| 3.0 - i as f64 * 0.5);
+    let c = V::splat(level, V::Scalar::of(0.25));
     let expect = |got: V, f: &dyn Fn(f64, f64) -> f64| {
         for (i, got) in lanes(got).into_iter().enumerate() {
             let exact = f(i as f64 + 1.0, 3.0 - i as f64 * 0.5);
@@ -77,7 +76,7 @@ fn arithmetic<V: Vector>() {
         bits | u32::from(i as f64 + 1.0 > 3.0 - i as f64 * 0.5) << i
     });
     assert_eq!(V::bits(a.above(b)), bits);
-    let nan = V::splat(V::Scalar::of(f64::NAN));
+    let nan = V::splat(level, V::Scalar::of(f64::NAN));
     assert_eq!(V::bits(nan.at_least(a)) | V::bits(a.above(nan)), 0);
     assert_eq!(lanes(nan.min(a)), lanes(a));
     assert_eq!(lanes(nan.max(a)), lanes(a));
@@ -89,10 +88,10 @@ fn arithmetic_is_that_of_floats() {
 }
 
 /// Powers by a polynomial of DEGREE are that precise, relatively.
-fn powers_to<V: Vector, const DEGREE: usize>(precision: f64) {
+fn powers_to<V: Vector, const DEGREE: usize>(level: V::Level, precision: f64) {
     for step in 0..40_000 {
         // The values as the scalar has them, so that only the power's own error counts.
-        let x = vector::<V>(|i| -(f64::from(step) + i as f64 / 16.0) * 0.003);
+        let x = vector::<V>(level, |i| -(f64::from(step) + i as f64 / 16.0) * 0.003);
         for (x, power) in lanes(x).into_iter().zip(lanes(x.exp2::<DEGREE>())) {
             let exact = x.exp2();
             assert!(
@@ -102,17 +101,17 @@ fn powers_to<V: Vector, const DEGREE: usize>(precision: f64) {
         }
     }
     assert_eq!(
-        lanes(V::splat(V::Scalar::ZERO).exp2::<DEGREE>()),
+        lanes(V::splat(level, V::Scalar::ZERO).exp2::<DEGREE>()),
         vec![1.0; V::LANES]
     );
     for far in [-1100.0, -1e9, f64::NEG_INFINITY] {
-        let power = lanes(V::splat(V::Scalar::of(far)).exp2::<DEGREE>());
+        let power = lanes(V::splat(level, V::Scalar::of(far)).exp2::<DEGREE>());
         assert!(power.iter().all(|&p| (0.0..2e-38).contains(&p)), "{power:?}");
     }
 }
 
-fn powers<V: Vector>() {
-    powers_to::<V, 5>(3.0 * epsilon::<V>());
+fn powers<V: Vector>(level: V::Level) {
+    powers_to::<V, 5>(level, 3.0 * epsilon::<V>());
 }
 
 #[test]
@@ -120,9 +119,9 @@ fn exp2_is_right_to_the_last_bits() {
     for_all_vectors!(powers);
 }
 
-fn rough_powers<V: Vector>() {
-    powers_to::<V, 4>(3.3e-6);
-    powers_to::<V, 3>(1.05e-4);
+fn rough_powers<V: Vector>(level: V::Level) {
+    powers_to::<V, 4>(level, 3.3e-6);
+    powers_to::<V, 3>(level, 1.05e-4);
 }
 
 #[test]
@@ -130,10 +129,10 @@ fn exp2_is_as_right_as_its_degree() {
     for_all_vectors!(rough_powers);
 }
 
-fn quotients<V: Vector>() {
+fn quotients<V: Vector>(level: V::Level) {
     for step in 1..=10_000 {
-        let divisor = vector::<V>(|i| (f64::from(step) - i as f64 / 32.0) * 1e-4);
-        let dividend = V::splat(V::Scalar::of(1.0 / 3.0));
+        let divisor = vector::<V>(level, |i| (f64::from(step) - i as f64 / 32.0) * 1e-4);
+        let dividend = V::splat(level, V::Scalar::of(1.0 / 3.0));
         for (d, q) in lanes(divisor).into_iter().zip(lanes(dividend.over(divisor))) {
             let exact = V::Scalar::of(1.0 / 3.0).as_f64() / d;
             assert!((q / exact - 1.0).abs() <= epsilon::<V>(), "1/3 / {d}: {q}");
@@ -146,15 +145,15 @@ fn quotients_are_right_to_the_last_bit() {
     for_all_vectors!(quotients);
 }
 
-fn sums<V: Vector>() {
-    let vectors: [V; 9] = std::array::from_fn(|n| vector(|i| (n * 100 + i) as f64));
+fn sums<V: Vector>(level: V::Level) {
+    let vectors: [V; 9] = std::array::from_fn(|n| vector(level, |i| (n * 100 + i) as f64));
     let sums = V::sums(&vectors);
     for (n, sum) in sums[..9].iter().enumerate() {
         let exact: usize = (0..V::LANES).map(|i| n * 100 + i).sum();
         assert_eq!(sum.as_f64(), exact as f64);
     }
     // The place of a vector among others must not matter to its sum.
-    let rough = vector::<V>(|i| 1.0 / (i as f64 + 0.7));
+    let rough = vector::<V>(level, |i| 1.0 / (i as f64 + 0.7));
     let equal = V::sums(&[rough; 14]);
     assert!(equal[..14].iter().all(|&sum| sum == equal[0]));
 }

@@ -7,17 +7,24 @@ pub(crate) const MAX_SUMS: usize = 16;
 
 /// `LANES` floats, and comparisons of them.
 ///
+/// A vector can only be made with its level, so every method that takes one may use its instructions.
+///
 /// `min` and `max` yield `other` if self is NaN.
 #[allow(unreachable_pub, missing_docs)]
 pub trait Vector: Copy {
     type Scalar: Real;
+    /// The instructions that it needs, as proof that the machine has them.
+    type Level: Copy;
     /// True or false per lane.
     type Mask: Copy;
     const LANES: usize;
 
-    fn splat(value: Self::Scalar) -> Self;
+    /// The value in every lane.
+    fn splat(level: Self::Level, value: Self::Scalar) -> Self;
     /// The first `LANES` values.
-    fn load(values: &[Self::Scalar]) -> Self;
+    fn load(level: Self::Level, values: &[Self::Scalar]) -> Self;
+    /// The proof that it was made with.
+    fn level(self) -> Self::Level;
     /// Into the first `LANES` values.
     fn store(self, values: &mut [Self::Scalar]);
 
@@ -51,7 +58,7 @@ pub trait Vector: Copy {
     /// self where the mask holds, else 0.
     fn keep(self, mask: Self::Mask) -> Self;
 
-    /// The sum of the lanes of each of N ≤ `MAX_SUMS` vectors, in the same order of additions for each.
+    /// The sum of the lanes of each of 1 ≤ N ≤ `MAX_SUMS` vectors, in the same order of additions for each.
     fn sums<const N: usize>(vectors: &[Self; N]) -> [Self::Scalar; MAX_SUMS];
 }
 
@@ -115,10 +122,10 @@ pub(super) const EXP2_F64: [f64; 13] = [
 #[inline(always)]
 pub(super) fn polynomial<V: Vector>(x: V, coefficients: &[V::Scalar]) -> V {
     let mut k = coefficients.len() - 1;
-    let mut sum = V::splat(coefficients[k]);
+    let mut sum = V::splat(x.level(), coefficients[k]);
     while k > 0 {
         k -= 1;
-        sum = sum.times_plus(x, V::splat(coefficients[k]));
+        sum = sum.times_plus(x, V::splat(x.level(), coefficients[k]));
     }
     sum
 }

@@ -18,14 +18,14 @@ pub(crate) struct TileCotangents<'a, T> {
     pub(crate) v_transmittance: &'a TilePlane<T>,
 }
 
-/// A block of pixels while the light is followed back.
+/// A block of pixels while splats are differentiated back to front.
 #[derive(Clone, Copy)]
 struct Block<T, const K: usize> {
     x: Lanes<T>,
     y: Lanes<T>,
     /// Transmittance behind the splat at hand.
     transmittance: Lanes<T>,
-    /// What lies behind, per unit of light that reaches it: Σ weight · value · v, and the background's part.
+    /// What lies behind, per unit of transmittance: Σ weight · value · v, and the background's part.
     behind: Lanes<T>,
     end: Lanes<T>,
     v_values: [Lanes<T>; K],
@@ -40,7 +40,7 @@ struct Sums<V, const K: usize> {
 
 #[inline(always)]
 fn absolute<V: Vector>(x: V) -> V {
-    x.max(V::splat(V::Scalar::ZERO).minus(x))
+    x.max(V::splat(x.level(), V::Scalar::ZERO).minus(x))
 }
 
 /// The rules of a render in vectors.
@@ -59,20 +59,28 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         lane: usize,
         rules: &Rules<V>,
     ) {
-        let (u, v) = entry.whitened(block.x.get::<V>(lane), block.y.get(lane));
+        let level = rules.one.level();
+        let (u, v) = entry.whitened(block.x.get::<V>(level, lane), block.y.get(level, lane));
         let raw = entry.raw_alpha::<V, DEGREE>(u, v);
         let hit = V::both(
-            block.end.get::<V>(lane).at_least(V::splat(entry.place)),
+            block
+                .end
+                .get::<V>(level, lane)
+                .at_least(V::splat(level, entry.place)),
             raw.at_least(rules.threshold),
         );
         let alpha = raw.min(rules.max_alpha).keep(hit);
-        let before = block.transmittance.get::<V>(lane).over(rules.one.minus(alpha));
+        let before = block
+            .transmittance
+            .get::<V>(level, lane)
+            .over(rules.one.minus(alpha));
         let weight = alpha.times(before);
-        // What this splat shows instead of what it hides.
-        let behind = block.behind.get::<V>(lane);
-        let mut change = V::splat(entry.values[0]).times_minus(block.v_values[0].get(lane), behind);
+        // The splat's colour less what it hides, both weighted by the incoming gradient.
+        let behind = block.behind.get::<V>(level, lane);
+        let mut change =
+            V::splat(level, entry.values[0]).times_minus(block.v_values[0].get(level, lane), behind);
         for k in 1..K {
-            change = V::splat(entry.values[k]).times_plus(block.v_values[k].get(lane), change);
+            change = V::splat(level, entry.values[k]).times_plus(block.v_values[k].get(level, lane), change);
         }
         let free = V::both(hit, rules.max_alpha.at_least(raw));
         let h = before.times(change).times(raw).keep(free);
@@ -89,10 +97,10 @@ impl<V: Vector, const K: usize> Sums<V, K> {
             hv.times_plus(v, mvv),
         ];
         for k in 0..K {
-            self.v_values[k] = weight.times_plus(block.v_values[k].get(lane), self.v_values[k]);
+            self.v_values[k] = weight.times_plus(block.v_values[k].get(level, lane), self.v_values[k]);
         }
         if ABSOLUTE {
-            let along_y = V::splat(entry.w12).times_plus(hu, V::splat(entry.w22).times(hv));
+            let along_y = V::splat(level, entry.w12).times_plus(hu, V::splat(level, entry.w22).times(hv));
             let [x, y] = self.absolutes;
             self.absolutes = [x.plus(absolute(hu)), y.plus(absolute(along_y))];
         }
@@ -101,7 +109,7 @@ impl<V: Vector, const K: usize> Sums<V, K> {
     /// The moments, then the gradients of the K channels, then the absolutes.
     #[inline(always)]
     fn reduced<const ABSOLUTE: bool>(&self) -> [V::Scalar; MAX_SUMS] {
-        let mut all = [V::splat(V::Scalar::ZERO); MAX_SUMS];
+        let mut all = [V::splat(self.moments[0].level(), V::Scalar::ZERO); MAX_SUMS];
         all[..MOMENTS].copy_from_slice(&self.moments);
         all[MOMENTS..MOMENTS + K].copy_from_slice(&self.v_values);
         if ABSOLUTE {
@@ -111,23 +119,22 @@ impl<V: Vector, const K: usize> Sums<V, K> {
     }
 }
 
-/// Writes what [`Sums::reduced`] yields into a slot. Channels after the first group add to the moments and the
-/// absolutes.
+/// Writes what [`Sums::reduced`] yields. Groups of channels after the first add to the moments and the absolutes.
 #[inline(always)]
 fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     task: &TileTask<'_, T>,
-    slot: &mut [T],
+    gradient: &mut [T],
     sums: &[T; MAX_SUMS],
 ) {
     let total = task.channels.total;
     if !ABSOLUTE && total == K && task.first == 0 {
         // As the general case, with a length that the compiler knows: no calls to copy a few bytes.
-        slot[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
+        gradient[..MOMENTS + K].copy_from_slice(&sums[..MOMENTS + K]);
         return;
     }
     let used = (total - task.first).min(K);
     let mut put = |place: usize, value: T, anew: bool| {
-        slot[place] = if anew { value } else { slot[place] + value };
+        gradient[place] = if anew { value } else { gradient[place] + value };
     };
     for k in 0..MOMENTS {
         put(k, sums[k], task.first == 0);
@@ -142,13 +149,14 @@ fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     }
 }
 
-/// Writes, for every splat of the tile, its moments and the gradients of its channels into its slot (`size` values
+/// Writes, for every splat of the tile, its moments and the gradients of its channels to `gradients` (`size` values
 /// each: the moments, then all channels, then the absolutes if ABSOLUTE).
 #[inline(always)]
 pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, const DEGREE: usize>(
+    level: V::Level,
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
-    slots: &mut [V::Scalar],
+    gradients: &mut [V::Scalar],
     size: usize,
 ) {
     let zero = V::Scalar::ZERO;
@@ -162,8 +170,9 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
         end: Lanes::ZERO,
         v_values: [Lanes::ZERO; K],
     }; MAX_BLOCKS];
-    // Blocks with a gradient, and where their lists end: a block sleeps until the walk comes to its end.
-    let mut sleeping = 0u16;
+    // Blocks with an incoming gradient, and the last splat that each uses. The walk goes back to front, so a block is
+    // skipped until the walk reaches that splat.
+    let mut waiting = 0u16;
     let mut ends = [0u32; MAX_BLOCKS];
     for (b, block) in state[..blocks].iter_mut().enumerate() {
         block.x = centres.x[b];
@@ -183,50 +192,50 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
         }
         let end = block.end.0.iter().fold(zero, |end, &lane| end.greater(lane));
         ends[b] = if any { end.past_ordinal() } else { 0 };
-        sleeping |= u16::from(ends[b] > 0) << b;
+        waiting |= u16::from(ends[b] > 0) << b;
     }
     let mut active = 0u16;
-    let mut wake_at = ends.iter().copied().max().unwrap_or(0) as usize;
+    let mut next_end = ends.iter().copied().max().unwrap_or(0) as usize;
     let rules = Rules {
-        threshold: V::splat(task.threshold()),
-        max_alpha: V::splat(task.limits.max_alpha),
-        one: V::splat(V::Scalar::ONE),
+        threshold: V::splat(level, task.threshold()),
+        max_alpha: V::splat(level, task.limits.max_alpha),
+        one: V::splat(level, V::Scalar::ONE),
     };
 
     let mut entries = [Entry::<V::Scalar, K>::ZERO; WORD];
-    for batch in (0..task.ranks.len()).step_by(WORD).rev() {
-        let masks = &pixels.masks[batch..task.ranks.len().min(batch + WORD)];
+    for batch in (0..task.gaussians.len()).step_by(WORD).rev() {
+        let masks = &pixels.masks[batch..task.gaussians.len().min(batch + WORD)];
         for (i, mask) in masks.iter().enumerate() {
             task.prefetch(batch + i + AHEAD);
-            if mask & (active | sleeping) != 0 {
+            if mask & (active | waiting) != 0 {
                 entries[i] = Entry::load(task, batch + i);
             }
         }
         for (i, mask) in masks.iter().enumerate().rev() {
-            if batch + i < wake_at {
-                wake_at = 0;
+            if batch + i < next_end {
+                next_end = 0;
                 for b in 0..blocks {
-                    if sleeping >> b & 1 != 0 {
+                    if waiting >> b & 1 != 0 {
                         if batch + i < ends[b] as usize {
                             active |= 1 << b;
-                            sleeping &= !(1 << b);
+                            waiting &= !(1 << b);
                         } else {
-                            wake_at = wake_at.max(ends[b] as usize);
+                            next_end = next_end.max(ends[b] as usize);
                         }
                     }
                 }
             }
             let mut rest = mask & active;
-            let slot = &mut slots[(batch + i) * size..][..size];
+            let gradient = &mut gradients[(batch + i) * size..][..size];
             if rest == 0 {
-                write::<V::Scalar, K, ABSOLUTE>(task, slot, &[zero; MAX_SUMS]);
+                write::<V::Scalar, K, ABSOLUTE>(task, gradient, &[zero; MAX_SUMS]);
                 continue;
             }
             let entry = &entries[i];
             let mut sums = Sums::<V, K> {
-                moments: [V::splat(zero); MOMENTS],
-                v_values: [V::splat(zero); K],
-                absolutes: [V::splat(zero); ABSOLUTES],
+                moments: [V::splat(level, zero); MOMENTS],
+                v_values: [V::splat(level, zero); K],
+                absolutes: [V::splat(level, zero); ABSOLUTES],
             };
             while rest != 0 {
                 let block = rest.trailing_zeros() as usize;
@@ -235,7 +244,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
                     sums.add::<ABSOLUTE, DEGREE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
                 }
             }
-            write::<V::Scalar, K, ABSOLUTE>(task, slot, &sums.reduced::<ABSOLUTE>());
+            write::<V::Scalar, K, ABSOLUTE>(task, gradient, &sums.reduced::<ABSOLUTE>());
         }
     }
 }

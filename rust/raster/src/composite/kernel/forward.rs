@@ -6,10 +6,11 @@ use crate::math::real::Real;
 use crate::simd::transpose_bits;
 use crate::simd::vector::Vector;
 
-/// Splats loaded and composited at once: few enough to stay in the first cache, and a tile that is spent loads no more.
+/// Splats loaded and composited at once: few enough to stay in the first-level cache, and a tile whose pixels have all
+/// stopped loads no more.
 const BATCH: usize = 2 * WORD;
 
-/// What forward leaves of a tile; pixels in block order. What is in it before does not matter.
+/// Where forward writes a tile; pixels in block order. Earlier contents do not matter.
 pub(crate) struct TileImage<'a, T> {
     /// For each of the kernel's channels, which may be more than are handled now, a plane of blocks.
     pub(crate) colors: &'a mut [Lanes<T>],
@@ -19,15 +20,15 @@ pub(crate) struct TileImage<'a, T> {
     pub(crate) end: &'a mut [Lanes<T>],
     /// Blocks that each listed splat reaches, without blocks that have stopped.
     pub(crate) masks: &'a mut [u16],
-    /// How many pixels stopped before the light of all splats was counted.
+    /// How many pixels stopped before the end of the list.
     pub(crate) saturated: &'a mut usize,
 }
 
-/// Some pixels of a block while light goes through them.
+/// Some pixels of a block while splats are composited front to back.
 #[derive(Clone, Copy)]
 struct Light<V, const K: usize> {
-    /// Transmittance as if no pixel ever stopped: it only falls, so what has come to the stop stays there, and one
-    /// multiplication is all that a splat waits for of the one before it. 0 for a pixel that is not rendered.
+    /// Transmittance as if no pixel ever stopped. It only falls, so a stopped pixel stays below the limit without being
+    /// marked, and the chain from splat to splat is a single multiply-add. 0 for a pixel that is not rendered.
     unstopped: V,
     /// Transmittance when the pixel stopped.
     transmittance: V,
@@ -45,6 +46,7 @@ struct Rules<V> {
 impl<V: Vector, const K: usize> Light<V, K> {
     #[inline(always)]
     fn pass<const DEGREE: usize>(&mut self, entry: &Entry<V::Scalar, K>, x: V, y: V, rules: &Rules<V>) {
+        let level = x.level();
         let (u, v) = entry.whitened(x, y);
         let raw = entry.raw_alpha::<V, DEGREE>(u, v);
         let hit = raw.at_least(rules.threshold);
@@ -54,9 +56,9 @@ impl<V: Vector, const K: usize> Light<V, K> {
         let weight = alpha.times(self.unstopped).keep(on);
         self.unstopped = next;
         self.transmittance = next.select(on, self.transmittance);
-        self.end = V::splat(entry.place).select(on, self.end);
+        self.end = V::splat(level, entry.place).select(on, self.end);
         for k in 0..K {
-            self.sums[k] = weight.times_plus(V::splat(entry.values[k]), self.sums[k]);
+            self.sums[k] = weight.times_plus(V::splat(level, entry.values[k]), self.sums[k]);
         }
     }
 }
@@ -64,6 +66,7 @@ impl<V: Vector, const K: usize> Light<V, K> {
 /// Composites one tile. `open` says which pixels of each block are to be rendered.
 #[inline(always)]
 pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
+    level: V::Level,
     task: &TileTask<'_, V::Scalar>,
     open: &[u16; MAX_BLOCKS],
     out: TileImage<'_, V::Scalar>,
@@ -72,9 +75,9 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
     let block_centres = BlockCentres::new(task);
     let centres = PixelCentres::new(task);
     let rules = Rules {
-        threshold: V::splat(task.threshold()),
-        max_alpha: V::splat(task.limits.max_alpha),
-        stop: V::splat(task.limits.min_transmittance),
+        threshold: V::splat(level, task.threshold()),
+        max_alpha: V::splat(level, task.limits.max_alpha),
+        stop: V::splat(level, task.limits.min_transmittance),
     };
     let mut unstopped = [Lanes::ZERO; MAX_BLOCKS];
     let mut taking: u16 = 0;
@@ -93,13 +96,13 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
 
     let mut entries = [Entry::<V::Scalar, K>::ZERO; BATCH];
     let mut batch = 0;
-    while batch < task.ranks.len() && taking != 0 {
-        let size = BATCH.min(task.ranks.len() - batch);
+    while batch < task.gaussians.len() && taking != 0 {
+        let size = BATCH.min(task.gaussians.len() - batch);
         let mut masks = [[0u16; WORD]; BATCH / WORD];
         for i in 0..size {
             task.prefetch(batch + i + AHEAD);
-            let splat = &task.splats[task.ranks[batch + i] as usize];
-            masks[i / WORD][i % WORD] = block_centres.reached::<V>(splat, task.centre(splat)) & taking;
+            let splat = &task.splats[task.gaussians[batch + i] as usize];
+            masks[i / WORD][i % WORD] = block_centres.reached::<V>(level, splat, task.centre(splat)) & taking;
             entries[i] = Entry::load(task, batch + i);
         }
         out.masks[batch..batch + size].copy_from_slice(&masks.as_flattened()[..size]);
@@ -111,15 +114,18 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
             rest &= rest - 1;
             let mut spent = true;
             for lane in (0..LANES).step_by(V::LANES) {
-                let (x, y) = (centres.x[block].get::<V>(lane), centres.y[block].get::<V>(lane));
+                let (x, y) = (
+                    centres.x[block].get::<V>(level, lane),
+                    centres.y[block].get::<V>(level, lane),
+                );
                 let mut light = Light::<V, K> {
-                    unstopped: unstopped[block].get(lane),
-                    transmittance: out.transmittance[block].get(lane),
-                    end: out.end[block].get(lane),
-                    sums: [V::splat(V::Scalar::ZERO); K],
+                    unstopped: unstopped[block].get(level, lane),
+                    transmittance: out.transmittance[block].get(level, lane),
+                    end: out.end[block].get(level, lane),
+                    sums: [V::splat(level, V::Scalar::ZERO); K],
                 };
                 for k in 0..K {
-                    light.sums[k] = out.colors[k * blocks + block].get(lane);
+                    light.sums[k] = out.colors[k * blocks + block].get(level, lane);
                 }
                 for (w, words) in words.iter().enumerate() {
                     let mut word = words[block];
@@ -144,13 +150,13 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
         }
         batch += size;
     }
-    out.masks[batch.min(task.ranks.len())..].fill(0);
+    out.masks[batch.min(task.gaussians.len())..].fill(0);
 
     let rendered: u32 = open[..blocks].iter().map(|bits| bits.count_ones()).sum();
     let mut unstopped_pixels = 0;
     for light in &unstopped[..blocks] {
         for lane in (0..LANES).step_by(V::LANES) {
-            unstopped_pixels += V::bits(light.get::<V>(lane).above(rules.stop)).count_ones();
+            unstopped_pixels += V::bits(light.get::<V>(level, lane).above(rules.stop)).count_ones();
         }
     }
     *out.saturated = (rendered - unstopped_pixels) as usize;

@@ -1,14 +1,15 @@
-//! One tile, front to back, until half the light is gone.
+//! One tile, front to back, until the transmittance of every pixel is at most one half.
 
 use super::{Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask};
 use crate::math::real::Real;
 use crate::simd::vector::{FINEST, Vector};
 
-/// For every pixel the [`Real::ordinal`] of the last splat that more than half the light reaches; 0 where there is
-/// none. Takes what [`super::forward_tile`] left of the tile, and composites as it does
+/// For every pixel the [`Real::ordinal`] of the last splat in front of which transmittance is above one half; 0 where there
+/// is none. Takes what [`super::forward_tile`] left of the tile, and composites as it does
 /// with the finest exponential.
 #[inline(always)]
 pub(crate) fn median_tile<V: Vector>(
+    level: V::Level,
     task: &TileTask<'_, V::Scalar>,
     masks: &[u16],
     end: &[Lanes<V::Scalar>],
@@ -16,37 +17,43 @@ pub(crate) fn median_tile<V: Vector>(
 ) {
     let blocks = task.side * task.side;
     let centres = PixelCentres::new(task);
-    let threshold = V::splat(task.threshold());
-    let max_alpha = V::splat(task.limits.max_alpha);
-    let half = V::splat(V::Scalar::of(0.5));
+    let threshold = V::splat(level, task.threshold());
+    let max_alpha = V::splat(level, task.limits.max_alpha);
+    let half = V::splat(level, V::Scalar::of(0.5));
     let mut transmittance = [Lanes::ONE; MAX_BLOCKS];
     *out = [Lanes::ZERO; MAX_BLOCKS];
-    let mut bright = u16::MAX >> (MAX_BLOCKS - blocks);
+    let mut above_half = u16::MAX >> (MAX_BLOCKS - blocks);
     for (index, mask) in masks.iter().enumerate() {
-        let mut rest = mask & bright;
+        let mut rest = mask & above_half;
         if rest == 0 {
             continue;
         }
         let entry = Entry::<V::Scalar, 1>::load(task, index);
-        let place = V::splat(entry.place);
+        let place = V::splat(level, entry.place);
         while rest != 0 {
             let block = rest.trailing_zeros() as usize & (MAX_BLOCKS - 1);
             rest &= rest - 1;
-            let mut dark = true;
+            let mut below = true;
             for lane in (0..LANES).step_by(V::LANES) {
-                let (u, v) = entry.whitened(centres.x[block].get::<V>(lane), centres.y[block].get(lane));
+                let (u, v) = entry.whitened(
+                    centres.x[block].get::<V>(level, lane),
+                    centres.y[block].get(level, lane),
+                );
                 let raw = entry.raw_alpha::<V, FINEST>(u, v);
-                let hit = V::both(end[block].get::<V>(lane).at_least(place), raw.at_least(threshold));
-                let before = transmittance[block].get::<V>(lane);
+                let hit = V::both(
+                    end[block].get::<V>(level, lane).at_least(place),
+                    raw.at_least(threshold),
+                );
+                let before = transmittance[block].get::<V>(level, lane);
                 let counts = V::both(hit, before.above(half));
-                out[block].set(lane, place.select(counts, out[block].get(lane)));
+                out[block].set(lane, place.select(counts, out[block].get(level, lane)));
                 let after = raw.min(max_alpha).keep(hit).times_from(before, before);
                 transmittance[block].set(lane, after);
-                dark &= V::bits(after.above(half)) == 0;
+                below &= V::bits(after.above(half)) == 0;
             }
-            bright &= !(u16::from(dark) << block);
+            above_half &= !(u16::from(below) << block);
         }
-        if bright == 0 {
+        if above_half == 0 {
             break;
         }
     }

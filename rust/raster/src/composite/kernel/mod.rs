@@ -1,7 +1,7 @@
 //! The two inner loops: one tile forward, one tile backward.
 //!
 //! A tile is cut into blocks of 4×4 pixels, 16 lanes: one AVX-512 vector, two of AVX2, four of SSE2 or NEON. The loops are
-//! written once, over the trait [`Vector`], and `dispatch` compiles them once per instruction set.
+//! written once, over the trait [`Vector`], and compiled once per CPU feature level.
 //!
 //! Forward walks block by block, so that transmittance and colour stay in registers while a block's own list goes by.
 //! Backward walks splat by splat, back to front, so that a splat's gradient is reduced once per tile, and recomputes
@@ -32,7 +32,7 @@ pub(crate) const BLOCK: usize = 4;
 pub(crate) const MAX_SIDE: usize = 16;
 /// Most blocks in a tile.
 pub(crate) const MAX_BLOCKS: usize = 16;
-/// Gradient values per (splat, tile) before those of the channels: h, hu, hv, huu, huv, hvv, where h is the gradient of
+/// Gradient values of an intersection before those of the channels: h, hu, hv, huu, huv, hvv, where h is the gradient of
 /// alpha times alpha.
 pub(crate) const MOMENTS: usize = 6;
 /// Gradient values after those of the channels where they are asked for: Σ |h u|, and Σ |h (w12 u + w22 v)|.
@@ -41,10 +41,10 @@ pub(crate) const ABSOLUTES: usize = 2;
 pub(crate) const MAX_CHANNELS: usize = 8;
 /// Splats whose block masks make a word per block.
 const WORD: usize = 64;
-/// Splats that are asked for ahead of the one being loaded.
+/// How many splats ahead of the one being loaded are prefetched.
 const AHEAD: usize = 12;
 
-/// One value per pixel of a block, where a vector register finds it: a load that straddles two cache lines is slow.
+/// One value per pixel of a block, aligned to a cache line: a load that straddles two is slow.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(64))]
 pub(crate) struct Lanes<T>(pub(crate) [T; LANES]);
@@ -72,8 +72,8 @@ impl<T: Real> Lanes<T> {
     }
 
     #[inline(always)]
-    fn get<V: Vector<Scalar = T>>(&self, first: usize) -> V {
-        V::load(&self.0[first..first + V::LANES])
+    fn get<V: Vector<Scalar = T>>(&self, level: V::Level, first: usize) -> V {
+        V::load(level, &self.0[first..first + V::LANES])
     }
 
     #[inline(always)]
@@ -105,7 +105,7 @@ pub(crate) struct TileTask<'a, T> {
     /// Blocks along a side.
     pub(crate) side: usize,
     /// The Gaussians of the tile's list, front to back.
-    pub(crate) ranks: &'a [u32],
+    pub(crate) gaussians: &'a [u32],
     /// By Gaussian.
     pub(crate) splats: &'a [Splat<T>],
     pub(crate) channels: Channels<'a, T>,
@@ -130,14 +130,14 @@ impl<T: Real> TileTask<'_, T> {
         [first(self.origin.0), first(self.origin.1)]
     }
 
-    /// Asks for the memory that a place of the list will be loaded from: Gaussians lie in no order of a tile's.
+    /// Prefetches the splat and the colours of a place in the list. Neighbours in the list are no neighbours in memory.
     #[inline(always)]
     fn prefetch(&self, index: usize) {
-        if let Some(&rank) = self.ranks.get(index) {
-            prefetch(self.splats, rank as usize);
+        if let Some(&gaussian) = self.gaussians.get(index) {
+            prefetch(self.splats, gaussian as usize);
             prefetch(
                 self.channels.colors,
-                rank as usize * self.channels.stride + self.first,
+                gaussian as usize * self.channels.stride + self.first,
             );
         }
     }
@@ -149,7 +149,7 @@ impl<T: Real> TileTask<'_, T> {
         [splat.x - x, splat.y - y]
     }
 
-    /// Alpha from which a pair counts; a limit of alpha below the threshold lets none count.
+    /// The least alpha of a pair that counts; infinite if alpha is limited to less than the threshold.
     #[inline(always)]
     fn threshold(&self) -> T {
         if self.limits.max_alpha >= self.limits.alpha_threshold {
@@ -190,12 +190,12 @@ impl<T: Real, const K: usize> Entry<T, K> {
 
     #[inline(always)]
     fn load(task: &TileTask<'_, T>, index: usize) -> Self {
-        let rank = task.ranks[index] as usize;
-        let splat = &task.splats[rank];
+        let gaussian = task.gaussians[index] as usize;
+        let splat = &task.splats[gaussian];
         let [x, y] = task.centre(splat);
         let mut values = [T::ZERO; K];
         let c = &task.channels;
-        let start = rank * c.stride + task.first;
+        let start = gaussian * c.stride + task.first;
         if task.first + K <= c.colored {
             values.copy_from_slice(&c.colors[start..start + K]);
         } else {
@@ -221,17 +221,18 @@ impl<T: Real, const K: usize> Entry<T, K> {
 
     #[inline(always)]
     fn whitened<V: Vector<Scalar = T>>(&self, x: V, y: V) -> (V, V) {
-        let u = V::splat(self.w12).times_plus(y, V::splat(self.u0));
+        let all = |value| V::splat(x.level(), value);
+        let u = all(self.w12).times_plus(y, all(self.u0));
         (
-            V::splat(self.w11).times_plus(x, u),
-            V::splat(self.w22).times_plus(y, V::splat(self.v0)),
+            all(self.w11).times_plus(x, u),
+            all(self.w22).times_plus(y, all(self.v0)),
         )
     }
 
     /// Alpha before it is limited: opacity · 2^−(u² + v²).
     #[inline(always)]
     fn raw_alpha<V: Vector<Scalar = T>, const DEGREE: usize>(&self, u: V, v: V) -> V {
-        let v2 = v.times_minus(v, V::splat(self.log_opacity));
+        let v2 = v.times_minus(v, V::splat(v.level(), self.log_opacity));
         u.minus_times_minus(u, v2).exp2::<DEGREE>()
     }
 }

@@ -31,19 +31,31 @@ impl<T: Real> BlockCentres<T> {
     ///
     /// The least of the form over a box that does not hold the centre lies on one of the two edges that face it.
     #[inline(always)]
-    pub(super) fn reached<V: Vector<Scalar = T>>(&self, splat: &Splat<T>, [x, y]: [T; 2]) -> u16 {
-        let (w11, w12, w22) = (V::splat(splat.w11), V::splat(splat.w12), V::splat(splat.w22));
-        let reach = V::splat(padded_reach(splat.reach));
+    pub(super) fn reached<V: Vector<Scalar = T>>(
+        &self,
+        level: V::Level,
+        splat: &Splat<T>,
+        [x, y]: [T; 2],
+    ) -> u16 {
+        let (w11, w12, w22) = (
+            V::splat(level, splat.w11),
+            V::splat(level, splat.w12),
+            V::splat(level, splat.w22),
+        );
+        let reach = V::splat(level, padded_reach(splat.reach));
         // On a vertical line the form is least at dy = −(w11 w12 / (w12² + w22²)) dx, on a horizontal one at
         // dx = −(w12 / w11) dy.
         let down = -(splat.w11 * splat.w12) / (splat.w12 * splat.w12 + splat.w22 * splat.w22);
-        let (down, across) = (V::splat(down), V::splat(-splat.w12 / splat.w11));
-        let (x, y) = (V::splat(x), V::splat(y));
-        let (span, zero) = (V::splat(T::of(BLOCK as f64 - 1.0)), V::splat(T::ZERO));
+        let (down, across) = (V::splat(level, down), V::splat(level, -splat.w12 / splat.w11));
+        let (x, y) = (V::splat(level, x), V::splat(level, y));
+        let (span, zero) = (
+            V::splat(level, T::of(BLOCK as f64 - 1.0)),
+            V::splat(level, T::ZERO),
+        );
         let mut mask = 0;
         for first in (0..LANES).step_by(V::LANES) {
-            let left = self.x.get::<V>(first).minus(x);
-            let top = self.y.get::<V>(first).minus(y);
+            let left = self.x.get::<V>(level, first).minus(x);
+            let top = self.y.get::<V>(level, first).minus(y);
             let (right, bottom) = (left.plus(span), top.plus(span));
             let near_x = left.max(right.min(zero));
             let near_y = top.max(bottom.min(zero));

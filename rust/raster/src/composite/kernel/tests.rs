@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::composite::dispatch;
-use crate::composite::slots::slot_size;
+use crate::composite::intersection_gradients::gradient_size;
 use crate::input::settings::RasterSettings;
 use crate::simd::Vectors;
-use crate::simd::level::SimdLevel;
-use crate::simd::portable::Array;
+use crate::simd::level::{Baseline, SimdLevel};
+use crate::simd::portable::Portable;
 use crate::simd::vector::FINEST;
 
 const SPLATS: usize = 150;
@@ -18,34 +18,29 @@ enum Runner {
     Portable,
 }
 
+impl Runner {
+    fn baseline() -> Self {
+        Self::Level(SimdLevel::Baseline(Baseline::guaranteed()))
+    }
+}
+
 fn runners() -> Vec<Runner> {
     let levels = SimdLevel::available().into_iter().map(Runner::Level);
     levels.chain([Runner::Portable]).collect()
 }
 
-/// The portable vectors in each scalar.
-trait Portable: Vectors {
-    type Vector: Vector<Scalar = Self>;
-}
-impl Portable for f32 {
-    type Vector = Array<f32>;
-}
-impl Portable for f64 {
-    type Vector = Array<f64>;
-}
-
 #[derive(Debug)]
 struct Outcome {
     image: Vec<f64>,
-    slots: Vec<f64>,
+    gradients: Vec<f64>,
 }
 
 /// Composites 150 splats, half of them faint, into one tile of 4·side pixels and follows a gradient back.
-fn run<T: Portable>(runner: Runner, channels: usize, side: usize) -> Outcome {
+fn run<T: Vectors>(runner: Runner, channels: usize, side: usize) -> Outcome {
     run_with::<T>(runner, channels, side, &RasterSettings::default())
 }
 
-fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings: &RasterSettings) -> Outcome {
+fn run_with<T: Vectors>(runner: Runner, channels: usize, side: usize, settings: &RasterSettings) -> Outcome {
     let mut state = 12345u64;
     let mut uniform = || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
@@ -73,7 +68,7 @@ fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings:
     let mut task = TileTask {
         origin: (64, 32),
         side,
-        ranks: &all,
+        gaussians: &all,
         splats: &splats,
         channels: Channels {
             colors: &colors,
@@ -91,9 +86,9 @@ fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings:
     let mut transmittance = vec![Lanes::ZERO; blocks];
     let mut end = vec![Lanes::ZERO; blocks];
     let mut masks = vec![0; SPLATS];
-    let size = slot_size(channels, false);
-    // Slots are written, not added to.
-    let mut slots = vec![T::of(f64::NAN); SPLATS * size];
+    let size = gradient_size(channels, false);
+    // IntersectionGradients are written, not added to.
+    let mut gradients = vec![T::of(f64::NAN); SPLATS * size];
     while task.first < channels {
         let out = TileImage {
             colors: &mut planes[task.first * blocks..],
@@ -104,7 +99,10 @@ fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings:
         };
         match runner {
             Runner::Level(level) => dispatch::forward(level, &task, &open, out),
-            Runner::Portable => forward_tile::<T::Vector, MAX_CHANNELS, FINEST>(&task, &open, out),
+            Runner::Portable => {
+                let level = Portable::guaranteed();
+                forward_tile::<T::In<Portable>, MAX_CHANNELS, FINEST>(level, &task, &open, out);
+            }
         }
         let mut plane = |_| std::array::from_fn(|_| Lanes(std::array::from_fn(|_| T::of(uniform() - 0.5))));
         let v_values = std::array::from_fn(&mut plane);
@@ -121,9 +119,18 @@ fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings:
             v_transmittance: &v_transmittance,
         };
         match runner {
-            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, &mut slots, size, false),
+            Runner::Level(level) => {
+                dispatch::backward(level, &task, &cotangents, &mut gradients, size, false)
+            }
             Runner::Portable => {
-                backward_tile::<T::Vector, MAX_CHANNELS, false, FINEST>(&task, &cotangents, &mut slots, size);
+                let level = Portable::guaranteed();
+                backward_tile::<T::In<Portable>, MAX_CHANNELS, false, FINEST>(
+                    level,
+                    &task,
+                    &cotangents,
+                    &mut gradients,
+                    size,
+                );
             }
         }
         task.first += MAX_CHANNELS;
@@ -134,7 +141,7 @@ fn run_with<T: Portable>(runner: Runner, channels: usize, side: usize, settings:
         .flat_map(|lanes| &lanes.0);
     Outcome {
         image: image.map(|v| v.as_f64()).collect(),
-        slots: slots.iter().map(|v| v.as_f64()).collect(),
+        gradients: gradients.iter().map(|v| v.as_f64()).collect(),
     }
 }
 
@@ -147,7 +154,7 @@ fn relative(a: &[f64], b: &[f64]) -> f64 {
 fn every_instruction_set_agrees_with_double_precision() {
     for channels in 1..=8 {
         for side in [1, 2, 4] {
-            let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), channels, side);
+            let exact = run::<f64>(Runner::baseline(), channels, side);
             for runner in runners() {
                 if matches!(runner, Runner::Portable) && channels < MAX_CHANNELS {
                     continue;
@@ -158,9 +165,9 @@ fn every_instruction_set_agrees_with_double_precision() {
                 );
                 let errors = [
                     (relative(&single.image, &exact.image), 1e-6),
-                    (relative(&single.slots, &exact.slots), 5e-6),
+                    (relative(&single.gradients, &exact.gradients), 5e-6),
                     (relative(&double.image, &exact.image), 1e-14),
-                    (relative(&double.slots, &exact.slots), 1e-13),
+                    (relative(&double.gradients, &exact.gradients), 1e-13),
                 ];
                 assert!(
                     errors.iter().all(|(error, limit)| error < limit),
@@ -177,10 +184,10 @@ fn channels_beyond_a_group_add_to_the_moments() {
         if matches!(runner, Runner::Portable) {
             continue;
         }
-        let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), 11, 4);
+        let exact = run::<f64>(Runner::baseline(), 11, 4);
         let single = run::<f32>(runner, 11, 4);
         assert!(relative(&single.image, &exact.image) < 1e-6);
-        assert!(relative(&single.slots, &exact.slots) < 5e-6, "{runner:?}");
+        assert!(relative(&single.gradients, &exact.gradients) < 5e-6, "{runner:?}");
     }
 }
 
@@ -188,7 +195,7 @@ fn channels_beyond_a_group_add_to_the_moments() {
 fn rough_exponentials_are_as_rough_as_their_degree() {
     for level in SimdLevel::available() {
         for channels in [1, 3, 5] {
-            let exact = run::<f64>(Runner::Level(SimdLevel::Baseline), channels, 4);
+            let exact = run::<f64>(Runner::baseline(), channels, 4);
             let errors = [3, 4, 5].map(|exp_degree| {
                 let settings = RasterSettings {
                     exp_degree,
@@ -197,7 +204,7 @@ fn rough_exponentials_are_as_rough_as_their_degree() {
                 let rough = run_with::<f32>(Runner::Level(level), channels, 4, &settings);
                 [
                     relative(&rough.image, &exact.image),
-                    relative(&rough.slots, &exact.slots),
+                    relative(&rough.gradients, &exact.gradients),
                 ]
             });
             for (error, limits) in errors.as_flattened().iter().zip([

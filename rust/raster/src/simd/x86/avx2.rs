@@ -37,12 +37,12 @@ macro_rules! masks256 {
 }
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F32x8(__m256);
+pub(crate) struct F32x8(__m256);
 
 impl Vector for F32x8 {
     type Mask = __m256;
     common!(
+        Avx2,
         f32,
         8,
         _mm256_set1_ps,
@@ -62,6 +62,7 @@ impl Vector for F32x8 {
         _mm256_fnmsub_ps
     );
     exp2_by_bits!(
+        _mm256_set1_ps,
         exp2_f32::<DEGREE>(&EXP2_F32),
         -126.0,
         12_582_912.0,
@@ -104,12 +105,12 @@ impl Vector for F32x8 {
 }
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F64x4(__m256d);
+pub(crate) struct F64x4(__m256d);
 
 impl Vector for F64x4 {
     type Mask = __m256d;
     common!(
+        Avx2,
         f64,
         4,
         _mm256_set1_pd,
@@ -129,6 +130,7 @@ impl Vector for F64x4 {
         _mm256_fnmsub_pd
     );
     exp2_by_bits!(
+        _mm256_set1_pd,
         &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,

@@ -36,12 +36,11 @@ macro_rules! masks512 {
 }
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F32x16(__m512);
+pub(crate) struct F32x16(__m512);
 
-/// One vector of what is to be added and one of what it is to be added to: of two pieces that are added, a blend makes
-/// one, which runs where a shuffle, the scarce one, does not. Not closures: one that the compiler does not inline would
-/// be compiled without these instructions.
+/// Steps of a sum over lanes: two vectors become one with half as many lanes for each. Of the two vectors that are added,
+/// one is made by a blend and not by a shuffle, because only one execution port shuffles. These are functions and not
+/// closures, because a closure that is not inlined would be compiled without AVX-512.
 impl F32x16 {
     #[inline(always)]
     fn by_8(self, other: Self) -> Self {
@@ -86,6 +85,7 @@ impl F32x16 {
 
 impl Vector for F32x16 {
     common!(
+        Avx512,
         f32,
         16,
         _mm512_set1_ps,
@@ -99,8 +99,7 @@ impl Vector for F32x16 {
     );
     #[inline(always)]
     fn over(self, other: Self) -> Self {
-        // A quotient from a reciprocal of 14 bits, corrected once by what it leaves: the division unit takes twice as
-        // long.
+        // A quotient from a reciprocal of 14 bits, corrected once by its remainder: the division unit takes twice as long.
         let reciprocal = Self(op!(_mm512_rcp14_ps(other.0)));
         let quotient = self.times(reciprocal);
         quotient.times_from(other, self).times_plus(reciprocal, quotient)
@@ -126,8 +125,8 @@ impl Vector for F32x16 {
     }
     #[inline(always)]
     fn sums<const N: usize>(vectors: &[Self; N]) -> [f32; MAX_SUMS] {
-        // Two vectors become one, half as many lanes for each, until one is left.
-        let mut pieces: [Self; MAX_SUMS] = [Self::splat(0.0); MAX_SUMS];
+        const { assert!(N > 0) };
+        let mut pieces = [Self(op!(_mm512_setzero_ps())); MAX_SUMS];
         pieces[..N].copy_from_slice(vectors);
         for i in 0..8 {
             pieces[i] = pieces[2 * i].by_8(pieces[2 * i + 1]);
@@ -139,7 +138,7 @@ impl Vector for F32x16 {
             pieces[i] = pieces[2 * i].by_2(pieces[2 * i + 1]);
         }
         let all = pieces[0].by_1(pieces[1]).0;
-        // Each vector's sum is now in the lane that its number, its four bits backwards, tells.
+        // The sum of vector i is now in the lane whose number is i with its four bits reversed.
         let order = op!(_mm512_setr_epi32(
             0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15
         ));
@@ -151,11 +150,11 @@ impl Vector for F32x16 {
 }
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F64x8(__m512d);
+pub(crate) struct F64x8(__m512d);
 
 impl Vector for F64x8 {
     common!(
+        Avx512,
         f64,
         8,
         _mm512_set1_pd,
@@ -181,6 +180,7 @@ impl Vector for F64x8 {
         _mm512_maskz_mov_pd
     );
     exp2_by_bits!(
+        _mm512_set1_pd,
         &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,

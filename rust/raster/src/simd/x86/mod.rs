@@ -3,31 +3,38 @@
 
 use std::arch::x86_64::*;
 
+use crate::simd::level::{Simd, Work};
 use crate::simd::vector::Vector;
 
 /// Calls an intrinsic that touches no memory.
 macro_rules! op {
     ($e:expr) => {
-        // SAFETY: the types of this file are only used inside functions compiled for their instructions, which
-        // `dispatch` calls after detecting them.
+        // SAFETY: a vector is only made with its level, which only a machine with these instructions has. They touch no
+        // memory.
         unsafe { $e }
     };
 }
 
 /// Methods that are one intrinsic for every x86 vector.
 macro_rules! common {
-    ($T:ty, $lanes:literal, $set1:ident, $loadu:ident, $storeu:ident, $add:ident, $sub:ident, $mul:ident, $min:ident, $max:ident) => {
+    ($Level:ident, $T:ty, $lanes:literal, $set1:ident, $loadu:ident, $storeu:ident, $add:ident, $sub:ident, $mul:ident, $min:ident, $max:ident) => {
         type Scalar = $T;
+        type Level = super::$Level;
         const LANES: usize = $lanes;
         #[inline(always)]
-        fn splat(value: $T) -> Self {
+        fn splat(_: super::$Level, value: $T) -> Self {
             Self(op!($set1(value)))
         }
         #[inline(always)]
-        fn load(values: &[$T]) -> Self {
+        fn load(_: super::$Level, values: &[$T]) -> Self {
             let values = &values[..$lanes];
             // SAFETY: the slice holds LANES values, and the load may be unaligned.
             Self(unsafe { $loadu(values.as_ptr()) })
+        }
+        #[inline(always)]
+        fn level(self) -> super::$Level {
+            // The vector was made with one.
+            super::$Level(())
         }
         #[inline(always)]
         fn store(self, values: &mut [$T]) {
@@ -90,7 +97,7 @@ macro_rules! fused {
 
 /// Two roundings: before FMA there is nothing else.
 macro_rules! separate {
-    () => {
+    ($set1:ident) => {
         #[inline(always)]
         fn times_plus(self, a: Self, b: Self) -> Self {
             self.times(a).plus(b)
@@ -105,18 +112,18 @@ macro_rules! separate {
         }
         #[inline(always)]
         fn minus_times_minus(self, a: Self, b: Self) -> Self {
-            Self::splat(0.0).minus(self.times(a).plus(b))
+            Self(op!($set1(0.0))).minus(self.times(a).plus(b))
         }
     };
 }
 
 /// 2^x by rounding to the nearest integer, which adding 1.5 · 2^mantissa does and leaves in the low bits.
 macro_rules! exp2_by_bits {
-    ($coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident, $from_int:ident, $shift:ident, $add:ident) => {
+    ($set1:ident, $coefficients:expr, $lowest:literal, $magic:literal, $mantissa:literal, $to_int:ident, $from_int:ident, $shift:ident, $add:ident) => {
         #[inline(always)]
         fn exp2<const DEGREE: usize>(self) -> Self {
-            let magic = Self::splat($magic);
-            let clipped = self.max(Self::splat($lowest));
+            let magic = Self(op!($set1($magic)));
+            let clipped = self.max(Self(op!($set1($lowest))));
             let shifted = clipped.plus(magic);
             let fraction = clipped.minus(shifted.minus(magic));
             let power = polynomial(fraction, $coefficients);
@@ -131,7 +138,12 @@ macro_rules! exp2_by_bits {
 /// The vector with this number, or zero.
 #[inline(always)]
 fn nth<V: Vector<Scalar = f32>, const N: usize>(vectors: &[V; N], i: usize) -> V {
-    if i < N { vectors[i] } else { V::splat(0.0) }
+    const { assert!(N > 0) };
+    if i < N {
+        vectors[i]
+    } else {
+        V::splat(vectors[0].level(), 0.0)
+    }
 }
 
 /// Four sums at once, each 128-bit part by itself: yields (a, b, c, d) in every part.
@@ -176,9 +188,92 @@ mod avx2;
 mod avx512;
 mod sse;
 
-pub(super) use avx2::{F32x8, F64x4};
-pub(super) use avx512::{F32x16, F64x8};
-pub(super) use sse::{F32x4, F64x2};
+use avx2::{F32x8, F64x4};
+use avx512::{F32x16, F64x8};
+use sse::{F32x4, F64x2};
+
+/// SSE2, which every 64-bit x86 has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sse2(());
+
+/// AVX2 with fused multiply-add.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Avx2(());
+
+/// AVX-512 with its instructions for bytes, words, doublewords and shorter vectors.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Avx512(());
+
+impl Sse2 {
+    /// Part of the target.
+    pub(crate) fn guaranteed() -> Self {
+        Self(())
+    }
+}
+
+impl Simd for Sse2 {
+    type F32 = F32x4;
+    type F64 = F64x2;
+
+    #[inline(always)]
+    fn run<W: Work>(self, work: W) -> W::Output {
+        work.run(self)
+    }
+}
+
+macro_rules! level {
+    ($Level:ident, $F32:ty, $F64:ty, $features:literal, $($feature:tt),*) => {
+        impl $Level {
+            /// The level, if this machine has it.
+            pub(crate) fn detect() -> Option<Self> {
+                ($(is_x86_feature_detected!($feature))&&*).then_some(Self(()))
+            }
+        }
+
+        impl Simd for $Level {
+            type F32 = $F32;
+            type F64 = $F64;
+
+            #[inline(always)]
+            fn run<W: Work>(self, work: W) -> W::Output {
+                #[target_feature(enable = $features)]
+                fn compiled<W: Work>(level: $Level, work: W) -> W::Output {
+                    work.run(level)
+                }
+                // SAFETY: only `detect` makes this value, on a machine with these features.
+                unsafe { compiled(self, work) }
+            }
+        }
+    };
+}
+level!(
+    Avx2,
+    F32x8,
+    F64x4,
+    "avx2,fma,bmi1,bmi2,popcnt,lzcnt",
+    "avx2",
+    "fma",
+    "bmi1",
+    "bmi2",
+    "popcnt",
+    "lzcnt"
+);
+level!(
+    Avx512,
+    F32x16,
+    F64x8,
+    "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma,bmi1,bmi2,popcnt,lzcnt",
+    "avx512f",
+    "avx512vl",
+    "avx512bw",
+    "avx512dq",
+    "avx2",
+    "fma",
+    "bmi1",
+    "bmi2",
+    "popcnt",
+    "lzcnt"
+);
 
 #[inline(always)]
 pub(in crate::simd) fn prefetch<U>(value: &U) {
@@ -190,7 +285,7 @@ pub(in crate::simd) fn prefetch<U>(value: &U) {
 pub(in crate::simd) fn transpose_bits(masks: &[u16; 64]) -> [u64; 16] {
     let mut words = [0u64; 16];
     for (quarter, masks) in masks.chunks_exact(16).enumerate() {
-        // SAFETY: SSE2 is part of x86-64; both loads are of 8 of the chunk's 16 masks and may be unaligned.
+        // SAFETY: SSE2 is part of x86-64; both loads are of 8 of the packet's 16 masks and may be unaligned.
         unsafe {
             let a = _mm_loadu_si128(masks.as_ptr().cast());
             let b = _mm_loadu_si128(masks.as_ptr().add(8).cast());

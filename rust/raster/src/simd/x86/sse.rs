@@ -6,12 +6,12 @@ use super::nth;
 use crate::simd::vector::{EXP2_F32, EXP2_F64, MAX_SUMS, Vector, exp2_f32, polynomial};
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F32x4(pub(super) __m128);
+pub(crate) struct F32x4(pub(super) __m128);
 
 impl Vector for F32x4 {
     type Mask = __m128;
     common!(
+        Sse2,
         f32,
         4,
         _mm_set1_ps,
@@ -24,8 +24,9 @@ impl Vector for F32x4 {
         _mm_max_ps
     );
     divided!(_mm_div_ps);
-    separate!();
+    separate!(_mm_set1_ps);
     exp2_by_bits!(
+        _mm_set1_ps,
         exp2_f32::<DEGREE>(&EXP2_F32),
         -126.0,
         12_582_912.0,
@@ -84,12 +85,12 @@ impl Vector for F32x4 {
 }
 
 #[derive(Clone, Copy)]
-#[allow(unreachable_pub)]
-pub struct F64x2(__m128d);
+pub(crate) struct F64x2(__m128d);
 
 impl Vector for F64x2 {
     type Mask = __m128d;
     common!(
+        Sse2,
         f64,
         2,
         _mm_set1_pd,
@@ -102,8 +103,9 @@ impl Vector for F64x2 {
         _mm_max_pd
     );
     divided!(_mm_div_pd);
-    separate!();
+    separate!(_mm_set1_pd);
     exp2_by_bits!(
+        _mm_set1_pd,
         &EXP2_F64,
         -1022.0,
         6_755_399_441_055_744.0,
