@@ -73,7 +73,7 @@ def check_rotations(name: str, matrices: Any) -> None:
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise InputError(
-            f"{name}: expected a rotation (orthonormal, determinant +1), found {shown(values[index].tolist())}"
+            f"{name}: expected a rotation (determinant +1), found {shown(values[index].tolist())}"
             f" at index {list(index)}"
         )
 

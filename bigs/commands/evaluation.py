@@ -16,7 +16,7 @@ from bigs.bench.page import Table, page
 from bigs.checks import InputError
 from bigs.commands.clips import open_clip
 from bigs.commands.paper_tables import beside_paper, mean_scores
-from bigs.commands.pictures import frame_scores, means, novel_scores
+from bigs.commands.pictures import frame_scores, means, novel_scores, partly
 from bigs.commands.run_clip import hand_models_of_run, origin_of
 from bigs.commands.run_folder import METRICS, load_run, write_json
 from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
@@ -27,6 +27,7 @@ from bigs.losses.perceptual import VggWeights, perceptual_distance
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.picture import ALL_METRICS, Distance
 from bigs.metrics.report import comparison_table, evaluate, match_frames, per_frame
+from bigs.metrics.report import remarks as remarks_on
 from bigs.models.playback import Playback
 from bigs.types import Side
 
@@ -64,10 +65,11 @@ class Evaluation:
     scores: dict[str, dict[str, float]]  # "result", and "initial" where the run had it, by key
     frames: dict[str, np.ndarray]  # by key, [T]
     remarks: tuple[str, ...]  # what could not be scored, and what to keep in mind
+    told: dict[str, str]  # why a score is missing, or over how many frames it is, by key
 
     def table(self) -> list[tuple[str, ...]]:
         """All scores as rows of text."""
-        return comparison_table(self.scores, ALL_METRICS, details=True)
+        return comparison_table(self.scores, ALL_METRICS, details=True, told=self.told)
 
 
 def evaluate_run(
@@ -100,12 +102,14 @@ def evaluate_run(
         )
     result: dict[str, float] = {}
     frames: dict[str, np.ndarray] = {}
+    told: dict[str, str] = {}
     if truth_path is None:
         remarks.append("poses and shapes are not scored: no ground truth (--gt)")
     else:
         listen(f"{run.name}: poses and shapes")
         truth = load_truth(truth_path, playback.frame_names, hand_models)
         result |= evaluate(playback.trajectory(), truth)
+        told |= remarks_on(playback.trajectory(), truth)
         order = match_frames(truth.frame_names, playback.frame_names)
         frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
     if clip is None:
@@ -115,18 +119,20 @@ def evaluate_run(
         pictures = frame_scores(clip, playback, distance)
         frames |= pictures
         result |= means(pictures)
+        told |= partly(pictures)
     novel = plan.novel or _own_novel(clip_path)
     if novel is not None:
         listen(f"{run.name}: held-back views")
         result |= novel_scores(playback, novel, distance, result.get("clip_scale"))
     if distance is None:
         remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")
+    remarks += _told_once(told)
     path = run / METRICS
     scores = json.loads(path.read_text()) if path.exists() else {}
     scores["result"] = scores.get("result", {}) | result
     write_json(path, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
-    return Evaluation(playback.name, scores, frames, tuple(remarks))
+    return Evaluation(playback.name, scores, frames, tuple(remarks), told)
 
 
 def run_names(runs: Sequence[Path]) -> list[str]:
@@ -162,6 +168,16 @@ def compare_runs(runs: Mapping[str, Evaluation], out: Path) -> list[Table]:
     with atomic_write(out / COMPARISON) as file:
         file.write(text.encode())
     return tables
+
+
+def _told_once(told: Mapping[str, str]) -> list[str]:
+    """What is told of scores, each thing once, with the scores that it is told of."""
+    lines = []
+    for text in dict.fromkeys(told.values()):
+        names = [ALL_METRICS[key].paper for key in told if told[key] == text]
+        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} others" if len(names) > 3 else "")
+        lines.append(f"{text}: {shown}")
+    return lines
 
 
 def _perceptual(files: Sequence[Path]) -> Distance | None:

@@ -65,6 +65,12 @@ def novel_scores(
     return scores
 
 
+def partly(columns: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Of scores that not every frame has, over how many frames `means` takes them, by key."""
+    counts = {key: (int(np.isfinite(values).sum()), len(values)) for key, values in columns.items()}
+    return {key: f"{count} of {whole} frames" for key, (count, whole) in counts.items() if count < whole}
+
+
 def means(columns: Mapping[str, np.ndarray]) -> dict[str, float]:
     """The mean of each column over the frames that have it; columns without any are left out."""
     finite = {key: values[np.isfinite(values)] for key, values in columns.items()}

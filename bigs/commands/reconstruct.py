@@ -15,7 +15,7 @@ from bigs.atomic import remove_parts
 from bigs.checks import InputError
 from bigs.commands.clips import open_estimates
 from bigs.commands.formats import write_outputs
-from bigs.commands.pictures import frame_scores, means
+from bigs.commands.pictures import frame_scores, means, partly
 from bigs.commands.prior_weights import load_prior
 from bigs.commands.run_folder import (
     CHECKPOINTS,
@@ -31,7 +31,7 @@ from bigs.commands.truth import load_truth
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.picture import ALL_METRICS
-from bigs.metrics.report import comparison_table, evaluate, per_frame
+from bigs.metrics.report import comparison_table, evaluate, per_frame, remarks
 from bigs.models.playback import record
 from bigs.train.checkpoint import FILE_NAME
 from bigs.train.config import RunConfig
@@ -128,7 +128,10 @@ def reconstruct(
             for line in report.skipped:
                 log_and_listen({"event": "skipped", "text": line})
         write_json(out / METRICS, scores)
-        table = comparison_table(scores, ALL_METRICS)
+        told = partly(frames)
+        if truth is not None:
+            told |= remarks(playback.trajectory(), truth)
+        table = comparison_table(scores, ALL_METRICS, told=told)
         if truth is not None:
             frames |= per_frame(playback.trajectory(), truth)
         write_pictures(out, clip, playback, Told(table, frames, log.events, report))

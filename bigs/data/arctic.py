@@ -19,7 +19,7 @@ from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import array_field, mapping_field, read_json, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
-from bigs.data.meshes import read_mesh
+from bigs.data.meshes import LONGEST_M, check_solid, read_mesh
 from bigs.data.optics import Optics
 from bigs.types import SIDES
 from bigs.unpickle import load_npy
@@ -27,8 +27,6 @@ from bigs.unpickle import load_npy
 # The paper's camera.
 DEFAULT_VIEW = 1
 MM_PER_M = 1000.0
-# What two hands hold is longer than 2 mm and shorter than 2 m: the template's unit can be told.
-_LONGEST_M = 2.0
 _IMAGE_FOLDERS = ("images", "cropped_images")
 # What the data set's own processing makes of a sequence lies in one of these, from ROOT: it has the boxes.
 _PROCESSED_FOLDERS = ("processed/seqs", "processed_verts/seqs")
@@ -303,8 +301,10 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     if not folder.is_dir():
         return None
     verts, faces = read_mesh(folder / "mesh.obj")
-    if np.ptp(verts, axis=0).max() > _LONGEST_M:
+    # Longer than 2 mm and shorter than 2 m: the template's unit can be told.
+    if np.ptp(verts, axis=0).max() > LONGEST_M:
         verts = verts / MM_PER_M
+    check_solid(str(folder / "mesh.obj"), verts, faces)
     file = view.raw("object")
     poses = array_field(str(file), load_npy(file), (n_rows, 7))[rows]
     angles = poses[:, 0]

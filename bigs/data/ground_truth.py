@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_faces, check_rotations
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, read_npz, require
-from bigs.data.meshes import read_mesh
+from bigs.data.fields import array_field, number_field, read_npz, require
+from bigs.data.meshes import check_solid, read_mesh
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
 OBJECT_FILE = "gt_object.ply"
+# A fist of a child, and a spread hand of the tallest man ever measured, with room to spare.
+SHORTEST_HAND_M, LONGEST_HAND_M = 0.02, 0.6
 
 
 def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
@@ -33,7 +35,8 @@ def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
         The trajectory; frames are named by `build/corres.txt` when the clip has one.
 
     Raises:
-        InputError: a missing or damaged file or field, or fields that disagree about the number of frames.
+        InputError: a missing or damaged file or field, fields that disagree about the number of frames, or a
+            truth that cannot be: matrices that are no rotations, an object or hand without extent.
     """
     path = Path(path)
     file = path / "gt.npz" if path.is_dir() else path
@@ -44,7 +47,10 @@ def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
         raise InputError(
             f"{file}: expected right_verts, left_verts or obj_R, found {', '.join(arrays) or 'nothing'}"
         )
-    frames = len(arrays[f"{present[0]}_verts" if present else "obj_R"])
+    first = f"{present[0]}_verts" if present else "obj_R"
+    frames = len(_field(file, arrays, first, ("T", "V" if present else 3, 3)))
+    if not frames:
+        raise InputError(f"{file}: {first}: expected at least one frame, found none")
 
     verts: dict[Side, np.ndarray] = {}
     joints: dict[Side, np.ndarray] = {}
@@ -52,6 +58,8 @@ def load_ground_truth(path: str | Path) -> HandObjectTrajectory:
     for side in present:
         verts[side] = _field(file, arrays, f"{side}_verts", (frames, "V", 3))
         joints[side] = _field(file, arrays, f"{side}_joints", (frames, 21, 3))
+        for key, points in ((f"{side}_verts", verts[side]), (f"{side}_joints", joints[side])):
+            _check_hand_size(f"{file}: {key}", points)
         faces[side] = _read_faces(file, arrays, f"{side}_faces", verts[side].shape[1])
     object_verts, object_faces = _read_object(file, arrays, frames) if has_object else (None, None)
     return HandObjectTrajectory(
@@ -78,7 +86,12 @@ def load_annotation(path: str | Path) -> Annotation:
     file = path / "gt.npz" if path.is_dir() else path
     arrays = read_npz(file, "ground truth")
     K = _field(file, arrays, "K", (3, 3))
-    width, height = _field(file, arrays, "wh", (2,)).astype(int)
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise InputError(f"{file}: K: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
+    size = _field(file, arrays, "wh", (2,))
+    if size.min() < 1 or (size != np.floor(size)).any():
+        raise InputError(f"{file}: wh: expected a width and a height in pixels, found {size.tolist()}")
+    width, height = size.astype(int)
     hands: dict[Side, HandTrack] = {}
     frames: int | str = "T"
     for side in SIDES:
@@ -96,9 +109,9 @@ def load_annotation(path: str | Path) -> Annotation:
     if "obj_R" in arrays:
         rotations, transl, scale = _object_poses(file, arrays, frames)
         frames = len(rotations)
-        verts, faces = read_mesh(file.parent / OBJECT_FILE)
-        obj = ObjectTruth(scale * verts, faces, rotations, transl, np.ones(frames, dtype=bool))
-    if not isinstance(frames, int):
+        verts, faces = _read_mesh(file, scale)
+        obj = ObjectTruth(verts, faces, rotations, transl, np.ones(frames, dtype=bool))
+    if not isinstance(frames, int) or not frames:
         raise InputError(f"{file}: expected right_pose, left_pose or obj_R, found {', '.join(arrays)}")
     return Annotation(
         name=file.resolve().parent.name,
@@ -129,23 +142,44 @@ def _object_poses(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotations [T, 3, 3], translations [T, 3] and the scale."""
     rotations = _field(file, arrays, "obj_R", (frames, 3, 3))
+    check_rotations(f"{file}: obj_R", rotations)
     transl = _field(file, arrays, "obj_t", (len(rotations), 3))
-    return rotations, transl, float(_field(file, arrays, "obj_scale", ())) if "obj_scale" in arrays else 1.0
+    scale = number_field(f"{file}: obj_scale", arrays["obj_scale"]) if "obj_scale" in arrays else 1.0
+    if scale <= 0:
+        raise InputError(f"{file}: obj_scale: expected a positive number, found {scale:g}")
+    return rotations, transl, scale
+
+
+def _read_mesh(file: Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """The object's vertices [V, 3] in metres, and its faces [F, 3]."""
+    mesh_file = file.parent / OBJECT_FILE
+    verts, faces = read_mesh(mesh_file)
+    check_solid(f"{mesh_file} (times obj_scale {scale:g})", scale * verts, faces)
+    return scale * verts, faces
 
 
 def _read_object(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> tuple[np.ndarray, np.ndarray]:
     rotations, transl, scale = _object_poses(file, arrays, frames)
-    own, faces = read_mesh(file.parent / OBJECT_FILE)
-    return np.einsum("tij,nj->tni", rotations, scale * own) + transl[:, None], faces
+    own, faces = _read_mesh(file, scale)
+    return np.einsum("tij,nj->tni", rotations, own) + transl[:, None], faces
+
+
+def _check_hand_size(where: str, points: np.ndarray) -> None:
+    """A hand that has no extent has no pose either."""
+    sizes = np.ptp(points, axis=1).max(axis=1) if points.shape[1] else np.zeros(len(points))
+    wrong = (sizes < SHORTEST_HAND_M) | (sizes > LONGEST_HAND_M)
+    if wrong.any():
+        t = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"{where}: expected a hand of {SHORTEST_HAND_M:g} to {LONGEST_HAND_M:g} m, found one of "
+            f"{sizes[t]:.3g} m in frame {t}"
+        )
 
 
 def _read_faces(file: Path, arrays: Mapping[str, np.ndarray], key: str, vertex_count: int) -> np.ndarray:
-    faces = _field(file, arrays, key, ("F", 3)).astype(np.int64)
-    if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
-        raise InputError(
-            f"{file}: {key}: expected indices below {vertex_count}, found {faces.min()} to {faces.max()}"
-        )
-    return faces
+    faces = _field(file, arrays, key, ("F", 3))
+    check_faces(f"{file}: {key}", faces, vertex_count)
+    return faces.astype(np.int64)
 
 
 def _frame_names(file: Path, frames: int) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
-from bigs.data.meshes import read_mesh
+from bigs.data.meshes import check_solid, read_mesh
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.types import Side
 from bigs.unpickle import restricted_load
@@ -181,6 +181,7 @@ def _read_object(
     if model is None:
         return None
     verts, faces = read_mesh(model)
+    check_solid(str(model), verts, faces)
     rotvecs = fill_rotations(_column(files, metas, "objRot", 3, valid)[:, None], valid)[:, 0]
     return ObjectTruth(
         verts=verts,

@@ -14,11 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
+from bigs.data.meshes import LONGEST_M, SHORTEST_M
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.types import Entity, Side
 
-# What two hands hold is longer than 2 mm and shorter than 2 m.
-SHORTEST_M, LONGEST_M = 0.002, 2.0
 # Projection is singular at the camera, and 100 m away a hand is a single pixel.
 NEAREST_M, FARTHEST_M = 0.01, 100.0
 # Estimators wind an axis-angle up by a turn or two; from here on float32 loses the angle itself.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape
+from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_rotations, check_shape
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-poses-1"
@@ -118,3 +118,9 @@ def _check(where: str, arrays: dict[str, np.ndarray]) -> None:
         if arrays[key].dtype.kind not in "fiu":
             raise InputError(f"{where}: {key}: expected numbers, found dtype {arrays[key].dtype}")
         check_finite(f"{where}: {key}", arrays[key])
+    if "object_rotations" in shapes:
+        check_rotations(f"{where}: object_rotations", arrays["object_rotations"])
+        if arrays["object_scale"] <= 0:
+            raise InputError(
+                f"{where}: object_scale: expected a positive number, found {arrays['object_scale']:g}"
+            )

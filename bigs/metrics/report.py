@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bigs.checks import InputError, check_shape
+from bigs.checks import InputError, check_faces, check_finite, check_shape
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.pose import clip_scale, mpjpe, wrist_error
 from bigs.metrics.shape import relative_scores
@@ -61,22 +61,66 @@ METRICS: dict[str, Metric] = {
     "mrrpe_r": Metric("MRRPE, right wrist to object", "mm", "lower", detail=True),
     "mrrpe_l": Metric("MRRPE, left wrist to object", "mm", "lower", detail=True),
 }
+# Ends of the keys that are scores of a single frame.
+_OF_ONE_FRAME = ("_icp", "_icp_sq", "_icp_arctic")
 
 
 def evaluate(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, float]:
     """All scores of a clip; `METRICS` says what each key means and in which unit.
 
-    Scores per frame are averaged over the frames whose truth is finite. What only one side has (a hand, the
-    object) has no keys. CD_o, F5 and F10 are those of the first such frame, as the evaluators have it.
+    Scores per frame are averaged over the frames that the truth has; `remarks` says so where it lacks some.
+    What only one side has (a hand, the object) has no keys; `remarks` says which. CD_o, F5 and F10 are those
+    of the first frame that the truth has, as the evaluators have it.
 
     Raises:
-        InputError: the two list different frames, or their arrays do not fit.
+        InputError: the two list different frames, their arrays do not fit, a value of the prediction is not
+            finite, or the truth of a frame is so in part.
     """
     pred = _matched(pred, gt)
     scores = {key: _mean_of_finite(values) for key, values in _frame_scores(pred, gt).items()}
     scores["clip_scale"] = trajectory_scale(pred, gt)
     scores |= _aligned_object_scores(pred, gt)
     return {key: scores[key] for key in METRICS if key in scores}
+
+
+def remarks(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, str]:
+    """Why scores of `evaluate` are missing, or over how many frames they are, by its keys.
+
+    Nothing is said of what neither side has, nor where all frames count.
+    """
+    found: dict[str, str] = {}
+    whole = len(gt.frame_names)
+    parts = [(f"{side} hand", pred.joints.get(side), gt.joints.get(side)) for side in SIDES]
+    known: dict[str, np.ndarray] = {}
+    absent: dict[str, str] = {}
+    for name, ours, theirs in (*parts, ("object", pred.object_verts, gt.object_verts)):
+        frames = None if theirs is None else np.isfinite(theirs).all(axis=(1, 2))
+        if ours is not None and frames is not None and frames.any():
+            known[name] = frames
+        elif ours is not None or theirs is not None:
+            absent[name] = f"the {'result has no' if ours is None else 'truth has no'} {name}"
+    for key in METRICS:
+        needed = _parts_of(key)
+        # A score about something that neither side has is no loss.
+        if not needed or not all(name in known or name in absent for name in needed):
+            continue
+        reason = next((absent[name] for name in needed if name in absent), "")
+        if reason:
+            found[key] = reason
+            continue
+        counted = int(np.logical_and.reduce([known[name] for name in needed]).sum())
+        if counted < whole and not key.endswith(_OF_ONE_FRAME):
+            found[key] = f"{counted} of {whole} frames"
+    return found
+
+
+def _parts_of(key: str) -> list[str]:
+    """What a score needs on both sides."""
+    words = key.removesuffix("_sq").split("_")
+    if key == "clip_scale":
+        return []
+    hands = {"r": ["right hand"], "l": ["left hand"], "h": ["right hand", "left hand"]}.get(words[-1], [])
+    return hands + (["object"] if words[0] in ("cd", "f5", "f10", "mrrpe") else [])
 
 
 def per_frame(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, np.ndarray]:
@@ -144,6 +188,7 @@ def comparison_table(
     metrics: Mapping[str, Metric] = METRICS,
     *,
     details: bool = False,
+    told: Mapping[str, str] | None = None,
 ) -> list[tuple[str, ...]]:
     """Columns of scores side by side, as text.
 
@@ -152,11 +197,12 @@ def comparison_table(
             `metrics` does not know are left out.
         metrics: the scores to show, in their order.
         details: show those that are marked so, too.
+        told: what `remarks` says of some scores, which then stands behind their names.
 
     Returns:
-        The heading ("score", "unit", names..., "change") and one tuple for each score that any of them has;
-        "-" where one lacks it. The last column says by how much the last column differs from the first; it is
-        missing when there is one column only.
+        The heading ("score", "unit", names..., "change") and one tuple for each score that any of them has,
+        or of which something is told; "-" where one lacks it. The last column says by how much the last
+        column of scores differs from the first; it is missing when there is one column only.
     """
     compared = len(rows) > 1
     table = [("score", "unit", *rows, *(["change"] if compared else []))]
@@ -164,11 +210,13 @@ def comparison_table(
         if metric.detail and not details:
             continue
         values = [scores.get(key, np.nan) for scores in rows.values()]
-        if not np.isfinite(values).any():
+        remark = (told or {}).get(key)
+        if not np.isfinite(values).any() and remark is None:
             continue
         shown = [f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}" for value in values]
         cells = [text if np.isfinite(value) else "-" for text, value in zip(shown, values, strict=True)]
-        table.append((metric.paper, metric.unit, *cells, *([_change(metric, values)] if compared else [])))
+        name = metric.paper if remark is None else f"{metric.paper}: {remark}"
+        table.append((name, metric.unit, *cells, *([_change(metric, values)] if compared else [])))
     return table
 
 
@@ -247,6 +295,19 @@ def _matched(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> HandObject
                 check_shape(f"{what}: joints of the {side} hand", joints, (n_frames, 21, 3))
         if clip.object_verts is not None:
             check_shape(f"{what}: object vertices", clip.object_verts, (n_frames, "V", 3))
+            if clip.object_faces is not None:
+                check_faces(f"{what}: object faces", clip.object_faces, clip.object_verts.shape[1])
+    for name, values in _named_points(pred):
+        check_finite(f"prediction: {name}", values)
+    for name, values in _named_points(gt):
+        finite = np.isfinite(values).all(axis=-1)
+        partly = np.flatnonzero(finite.any(axis=1) & ~finite.all(axis=1))
+        if partly.size:
+            point = int(np.flatnonzero(~finite[partly[0]])[0])
+            raise InputError(
+                f"ground truth: {name}: expected all of a frame or nothing of it, found point {point} of "
+                f"frame {int(partly[0])} not finite"
+            )
     order = match_frames(pred.frame_names, gt.frame_names)
     return HandObjectTrajectory(
         name=pred.name,
@@ -257,6 +318,12 @@ def _matched(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> HandObject
         object_verts=None if pred.object_verts is None else pred.object_verts[order],
         object_faces=pred.object_faces,
     )
+
+
+def _named_points(clip: HandObjectTrajectory) -> list[tuple[str, np.ndarray]]:
+    """All that is scored, [T, N, 3] each."""
+    points = [(f"joints of the {side} hand", joints) for side, joints in clip.joints.items()]
+    return [(name, v) for name, v in (*points, ("object vertices", clip.object_verts)) if v is not None]
 
 
 def _common_sides(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> list[Side]:

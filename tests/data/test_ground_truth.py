@@ -25,8 +25,8 @@ def truth_arrays() -> dict[str, Any]:
         "obj_scale": 2.0,
     }
     for side in ("right", "left"):
-        arrays[f"{side}_verts"] = rng.normal(size=(FRAMES, 7, 3))
-        arrays[f"{side}_joints"] = rng.normal(size=(FRAMES, 21, 3))
+        arrays[f"{side}_verts"] = 0.04 * rng.normal(size=(FRAMES, 7, 3))
+        arrays[f"{side}_joints"] = 0.04 * rng.normal(size=(FRAMES, 21, 3))
         arrays[f"{side}_faces"] = rng.integers(0, 7, (9, 3))
     return arrays
 
@@ -79,7 +79,21 @@ def broken(key: str, value: Any) -> dict[str, Any]:
         (broken("right_joints", np.zeros((FRAMES, 16, 3))), r"right_joints.*21.*16"),
         (broken("left_verts", np.zeros((FRAMES + 1, 7, 3))), r"left_verts.*\[3, V, 3\]"),
         (broken("right_verts", np.full((FRAMES, 7, 3), np.nan)), r"right_verts.*nan"),
-        (broken("right_faces", np.full((9, 3), 7)), r"right_faces.*below 7"),
+        (broken("right_verts", np.zeros(())), r"right_verts.*\[T, V, 3\]"),
+        (broken("right_verts", np.zeros((0, 7, 3))), "right_verts.*at least one frame"),
+        (broken("right_verts", np.zeros((FRAMES, 7, 3))), r"right_verts.*a hand of .* found one of 0 m"),
+        (broken("left_joints", np.full((FRAMES, 21, 3), 0.5)), r"left_joints.*a hand of .* found one of 0 m"),
+        (broken("left_joints", 100 * truth_arrays()["left_joints"]), "left_joints.*a hand of"),
+        (broken("right_faces", np.full((9, 3), 7)), r"right_faces.*0 to 6, found 7"),
+        (broken("right_faces", np.full((9, 3), 0.5)), r"right_faces.*whole numbers"),
+        (broken("right_faces", np.full((9, 3), -1)), r"right_faces.*0 to 6, found -1"),
+        (broken("obj_R", np.zeros((FRAMES, 3, 3))), r"obj_R.*rotation.*index \[0\]"),
+        (broken("obj_R", -np.repeat(np.eye(3)[None], FRAMES, axis=0)), r"obj_R.*determinant"),
+        (broken("obj_R", 2 * np.repeat(np.eye(3)[None], FRAMES, axis=0)), r"obj_R.*rotation"),
+        (broken("obj_scale", 0.0), "obj_scale.*positive"),
+        (broken("obj_scale", -2.0), "obj_scale.*positive.*-2"),
+        (broken("obj_scale", np.nan), "obj_scale.*nan"),
+        (broken("obj_scale", np.ones(2)), "obj_scale.*one number"),
         (broken("obj_R", np.zeros((FRAMES, 9))), "obj_R"),
         ({"K": np.eye(3)}, "right_verts, left_verts or obj_R"),
     ],
@@ -119,3 +133,44 @@ def test_shared_clips(shared_clip: Path) -> None:
     mesh = trimesh.Trimesh(truth.object_verts[t], truth.object_faces, process=False)
     _, distance, _ = trimesh.proximity.closest_point(mesh, truth.verts["right"][t][::3])
     assert distance.min() < 0.006
+
+
+def spread(verts: list[list[float]], faces: list[list[int]]) -> trimesh.Trimesh:
+    return trimesh.Trimesh(verts, faces, process=False)
+
+
+CORNERS = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]
+
+
+@pytest.mark.parametrize(
+    ("mesh", "words"),
+    [
+        (spread([*CORNERS[:2], [0.0, np.nan, 0.0]], [[0, 1, 2]]), "nan at index"),
+        (spread(CORNERS[:3], [[0, 1, 2]]), "surface of a solid"),
+        (spread(CORNERS, [[0, 1, 2]]), "surface of a solid"),
+        (spread(CORNERS, [[0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]]), "surface of a solid"),
+        (trimesh.creation.box(extents=(1e-9, 1e-9, 1e-9)), "surface of 0.002 to 2 m"),
+        (trimesh.creation.box(extents=(50.0, 50.0, 50.0)), "surface of 0.002 to 2 m"),
+    ],
+)
+def test_an_object_without_shape(tmp_path: Path, mesh: trimesh.Trimesh, words: str) -> None:
+    with pytest.raises(InputError, match=rf"gt_object\.ply.*{words}"):
+        load_ground_truth(write_ground_truth(tmp_path, arrays=truth_arrays(), object_mesh=mesh))
+
+
+def test_a_mesh_whose_faces_name_no_vertex(tmp_path: Path) -> None:
+    file = write_ground_truth(tmp_path, arrays=truth_arrays(), object_mesh=None)
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    verts = "".join(f"{x} {y} {z}\n" for x, y, z in CORNERS)
+    (tmp_path / "gt_object.ply").write_text(f"{head}{verts}3 0 1 9\n")
+    with pytest.raises(InputError, match=r"gt_object\.ply"):
+        load_ground_truth(file)
+
+
+def test_one_vertex_that_is_no_number_is_named(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(radius=0.05)
+    mesh.vertices[17, 2] = np.nan
+    file = write_ground_truth(tmp_path, arrays=truth_arrays(), object_mesh=mesh)
+    with pytest.raises(InputError, match=r"gt_object\.ply: vertices: .*nan at index \[17, 2\]"):
+        load_ground_truth(file)

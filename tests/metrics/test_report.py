@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
-from bigs.metrics.report import METRICS, comparison_table, evaluate, match_frames, per_frame
+from bigs.metrics.report import METRICS, comparison_table, evaluate, match_frames, per_frame, remarks
 from bigs.types import HandObjectTrajectory
 
 CLIPS, HAND_MODEL = os.environ.get("BIGS_CLIPS"), os.environ.get("BIGS_HAND_MODEL")
@@ -118,6 +118,41 @@ def test_what_is_missing_has_no_score(truth):
     no_object = dataclasses.replace(truth, object_verts=None, object_faces=None)
     assert not any(key.startswith(("cd", "f5", "f10")) for key in evaluate(truth, no_object))
     assert evaluate(dataclasses.replace(truth, joints={}), truth)["clip_scale"] == pytest.approx(1.0)
+
+
+def test_what_is_missing_is_told(truth):
+    assert remarks(truth, truth) == {}
+    one_hand = dataclasses.replace(truth, joints={"right": truth.joints["right"]})
+    told = remarks(one_hand, truth)
+    assert told["mpjpe_ra_l"] == told["cd_l_sq"] == told["mrrpe_l"] == "the result has no left hand"
+    assert told["mpjpe_ra_h"] == "the result has no left hand" and "mpjpe_ra_r" not in told
+    assert remarks(truth, one_hand)["wrist_l"] == "the truth has no left hand"
+    assert remarks(one_hand, one_hand) == {}
+    no_object = dataclasses.replace(truth, object_verts=None, object_faces=None)
+    told = remarks(truth, no_object)
+    assert told["cd_icp_sq"] == told["f5_cam"] == told["cd_r"] == "the truth has no object"
+    table = comparison_table({"result": evaluate(truth, no_object)}, details=True, told=told)
+    assert ("CD_o: the truth has no object", "cm²", "-") in table
+    holes = dataclasses.replace(truth, joints={side: v.copy() for side, v in truth.joints.items()})
+    holes.joints["left"][1] = np.nan
+    told = remarks(truth, holes)
+    assert told["mpjpe_ra_l"] == told["mpjpe_ra_h"] == told["cd_l"] == "3 of 4 frames"
+    assert "mpjpe_ra_r" not in told and "cd_icp" not in told
+
+
+@pytest.mark.parametrize("part", ["joints", "object"])
+def test_one_value_that_is_no_number_is_named(truth, part):
+    broken = dataclasses.replace(
+        truth,
+        joints={side: v.copy() for side, v in truth.joints.items()},
+        object_verts=truth.object_verts.copy(),
+    )
+    values = broken.joints["left"] if part == "joints" else broken.object_verts
+    values[2, 3, 1] = np.nan
+    with pytest.raises(InputError, match=rf"prediction: .*{part}.*nan at index \[2, 3, 1\]"):
+        evaluate(broken, truth)
+    with pytest.raises(InputError, match=rf"ground truth: .*{part}.*point 3 of frame 2"):
+        evaluate(truth, broken)
 
 
 def test_frame_names_that_do_not_match_are_named():

@@ -172,7 +172,7 @@ def test_a_file_of_something_else_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"expected format {FORMAT}, found None"):
         load_playback(path)
     save_file({"x": torch.zeros(2)}, path, {"bigs": json.dumps({"format": "bigs-scene-999"})})
-    with pytest.raises(InputError, match="found .bigs-scene-999.*"):
+    with pytest.raises(InputError, match="bigs-scene-999"):
         load_playback(path)
     path.write_bytes(b"\x00" * 100)
     with pytest.raises(InputError, match="damaged"):
