@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 from scipy.spatial.transform import Rotation
+
+from bigs.preprocess.schur import Sightings, System, linearise, point_steps, reduce, sort_sightings
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,13 @@ def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndar
         The adjusted bundle; its gauge (pose and size of the object frame) is free to drift a little.
     """
     free = np.ones(len(bundle.rotations), dtype=bool) if free is None else free
+    problem = _Problem(sort_sightings(bundle.frame, bundle.point, bundle.pixels, free), free, K, config)
     damping = 1e-3
     cost = _cost(bundle, K, config)
     for _ in range(config.iterations):
-        system = _linearise(bundle, K, config, free)
+        system = _linearise(problem, bundle)
         for _ in range(6):
-            candidate = _step(bundle, system, free, damping)
+            candidate = _step(problem, bundle, system, damping)
             new_cost = _cost(candidate, K, config)
             if new_cost < cost:
                 break
@@ -85,8 +87,9 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
     To first order, for independent reprojection errors of `config.pixel_sigma`. The gauge has no part in it.
     """
     free = np.ones(len(bundle.rotations), dtype=bool)
-    system = _linearise(bundle, K, config, free)
-    covariance = np.linalg.pinv(_reduced(system, 0.0)[0], rcond=1e-10, hermitian=True)
+    problem = _Problem(sort_sightings(bundle.frame, bundle.point, bundle.pixels, free), free, K, config)
+    reduced = reduce(_linearise(problem, bundle), problem.seen, 0.0)
+    covariance = np.linalg.pinv(reduced.matrix, rcond=1e-10, hermitian=True)
     blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
     own = np.einsum("titi->t", blocks)
     # A turn of frame s by d is seen in frame t as the same turn of the object, carried along.
@@ -95,14 +98,13 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
     return np.degrees(np.sqrt((own[:, None] + own - 2.0 * cross).clip(0.0)))
 
 
-class _System(NamedTuple):
-    """Normal equations: poses [6F], points [3N], and their coupling."""
+class _Problem(NamedTuple):
+    """What stays the same from step to step."""
 
-    poses: np.ndarray  # [6F, 6F]
-    points: np.ndarray  # [N, 3, 3]
-    coupling: scipy.sparse.bsr_matrix  # [6F, 3N]
-    pose_gradient: np.ndarray  # [6F]
-    point_gradient: np.ndarray  # [N, 3]
+    seen: Sightings
+    free: np.ndarray  # [T] bool, frames whose pose may change
+    K: np.ndarray
+    config: BundleConfig
 
 
 def _in_camera(bundle: Bundle) -> np.ndarray:
@@ -143,139 +145,53 @@ def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np
     )
 
 
-def _linearise(bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray) -> _System:
-    """Normal equations about `bundle`; a pose changes by a turn about the object's origin, and a shift."""
-    residual, rows_pose, rows_point = _jacobians(bundle, K)
-    weight = _cauchy((residual**2).sum(1) / config.pixel_sigma**2)[1] / config.pixel_sigma**2
-    root = np.sqrt(weight)[:, None]
-    residual, rows_pose, rows_point = root * residual, root[:, None] * rows_pose, root[:, None] * rows_point
-
-    count, frames = len(bundle.points), int(free.sum())
-    points = _sum_by(bundle.point, _products(rows_point, rows_point), count)
-    point_gradient = _sum_by(bundle.point, _products(rows_point, residual[:, :, None])[:, :, 0], count)
-
-    slot = np.cumsum(free) - 1
-    moving = np.flatnonzero(free[bundle.frame])
-    # In the order of the coupling's rows.
-    moving = moving[np.lexsort((bundle.point[moving], slot[bundle.frame[moving]]))]
-    row, rows_pose = slot[bundle.frame[moving]], rows_pose[moving]
-    poses = np.zeros((frames, 6, frames, 6))
-    diagonal = np.arange(frames)
-    poses[diagonal, :, diagonal, :] = _sum_by(row, _products(rows_pose, rows_pose), frames)
-    pose_gradient = _sum_by(row, _products(rows_pose, residual[moving][:, :, None])[:, :, 0], frames)
-    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=frames))])
-    coupling = scipy.sparse.bsr_matrix(
-        (_products(rows_pose, rows_point[moving]), bundle.point[moving], starts),
-        shape=(6 * frames, 3 * count),
-        blocksize=(6, 3),
+def _linearise(problem: _Problem, bundle: Bundle) -> System:
+    """Normal equations about `bundle`, the prior's part included."""
+    frames = int(problem.free.sum())
+    system = linearise(
+        problem.seen,
+        bundle.rotations,
+        bundle.transl,
+        bundle.points[problem.seen.points],
+        problem.K,
+        problem.config.pixel_sigma,
+        frames,
     )
-    _add_prior(poses, pose_gradient, bundle, config, free, slot)
-    return _System(
-        poses.reshape(6 * frames, 6 * frames), points, coupling, pose_gradient.ravel(), point_gradient
-    )
+    poses, gradient = system.poses.reshape(frames, 6, frames, 6), system.pose_gradient.reshape(frames, 6)
+    _add_prior(poses, gradient, bundle, problem)
+    return system
 
 
-def _jacobians(bundle: Bundle, K: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Reprojection errors [M, 2], and how they change with the pose [M, 2, 6] and the point [M, 2, 3].
-
-    Element by element: products of many small matrices take numpy most of an adjustment's time.
-    """
-    rotation = bundle.rotations[bundle.frame]
-    cam = _in_camera(bundle)
-    right, down, ahead = (cam - bundle.transl[bundle.frame]).T
-    depth = np.where(cam[:, 2] > 1e-6, cam[:, 2], 1e-6)
-    slopes = cam[:, :2] / depth[:, None]
-    by_pose, by_point = np.zeros((len(cam), 2, 6)), np.empty((len(cam), 2, 3))
-    for axis in range(2):
-        scale, slope = K[axis, axis] / depth, slopes[:, axis]
-        by_pose[:, axis, 3 + axis] = scale
-        by_pose[:, axis, 5] = -scale * slope
-        by_point[:, axis] = scale[:, None] * (rotation[:, axis] - slope[:, None] * rotation[:, 2])
-    # The spoke from the object's origin to the point, crossed with the row of the shift.
-    scale, slope = K[0, 0] / depth, slopes[:, 0]
-    by_pose[:, 0, :3] = np.stack(
-        [-down * scale * slope, ahead * scale + right * scale * slope, -down * scale], axis=1
-    )
-    scale, slope = K[1, 1] / depth, slopes[:, 1]
-    by_pose[:, 1, :3] = np.stack(
-        [-down * scale * slope - ahead * scale, right * scale * slope, right * scale], axis=1
-    )
-    return slopes * (K[0, 0], K[1, 1]) + K[:2, 2] - bundle.pixels, by_pose, by_point
-
-
-def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The transposes of `left` [M, 2, A] times `right` [M, 2, B]: [M, A, B]."""
-    return left[:, 0, :, None] * right[:, 0, None, :] + left[:, 1, :, None] * right[:, 1, None, :]
-
-
-def _add_prior(
-    poses: np.ndarray,
-    gradient: np.ndarray,
-    bundle: Bundle,
-    config: BundleConfig,
-    free: np.ndarray,
-    slot: np.ndarray,
-) -> None:
+def _add_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem) -> None:
     """Add the prior's part in place. Steps are small, so turns are differenced as if they commuted."""
+    config, free = problem.config, problem.free
     depth = float(np.median(bundle.transl[:, 2]))
     scales = (1.0 / np.radians(config.turn_sigma), 1.0 / (config.shift_sigma * depth))
+    slot = np.cumsum(free) - 1
+    first = np.arange(max(len(free) - 2, 0))  # of three frames, whose poses are differenced
     for part, (values, scale) in enumerate(zip(_accelerations(bundle, config), scales, strict=True)):
-        weights = _soft((values**2).sum(1))[1]
-        columns = slice(3 * part, 3 * part + 3)
-        for middle, (value, weight) in enumerate(zip(values, weights, strict=True), start=1):
-            for i, a in enumerate((middle - 1, middle, middle + 1)):
-                if not free[a]:
-                    continue
-                gradient[slot[a], columns] += weight * _SECOND[i] * scale * value
-                for j, b in enumerate((middle - 1, middle, middle + 1)):
-                    if free[b]:
-                        block = poses[slot[a], columns, slot[b], columns]
-                        block[np.arange(3), np.arange(3)] += weight * _SECOND[i] * _SECOND[j] * scale**2
+        columns = np.arange(3 * part, 3 * part + 3)
+        weights = _soft((values**2).sum(1))[1][:, None]
+        for i, own in enumerate(_SECOND):
+            here = free[first + i]
+            gradient[slot[first + i][here][:, None], columns] += (weights * own * scale * values)[here]
+            for j, other in enumerate(_SECOND):
+                both = here & free[first + j]
+                a, b = slot[first + i][both][:, None], slot[first + j][both][:, None]
+                poses[a, columns, b, columns] += weights[both] * own * other * scale**2
 
 
 # Coefficients of a second difference.
 _SECOND = (1.0, -2.0, 1.0)
 
 
-def _step(bundle: Bundle, system: _System, free: np.ndarray, damping: float) -> Bundle:
+def _step(problem: _Problem, bundle: Bundle, system: System, damping: float) -> Bundle:
     """One damped Gauss-Newton step."""
-    reduced, scaled, inverse = _reduced(system, damping)
-    frames = int(free.sum())
-    right = scaled @ system.point_gradient.ravel() - system.pose_gradient
-    change = scipy.linalg.solve(reduced, right, assume_a="sym")
-    pull = (system.coupling.T @ change).reshape(-1, 3) + system.point_gradient
-    moved = -np.einsum("nij,nj->ni", inverse, pull)
-    change = change.reshape(frames, 6)
-    rotations, transl = bundle.rotations.copy(), bundle.transl.copy()
+    reduced = reduce(system, problem.seen, damping)
+    change = scipy.linalg.solve(reduced.matrix, -reduced.gradient, assume_a="sym").reshape(-1, 6)
+    rotations, transl, points = bundle.rotations.copy(), bundle.transl.copy(), bundle.points.copy()
+    free = problem.free
     rotations[free] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotations[free]
     transl[free] += change[:, 3:]
-    return bundle._replace(rotations=rotations, transl=transl, points=bundle.points + moved)
-
-
-def _reduced(system: _System, damping: float) -> tuple[np.ndarray, scipy.sparse.bsr_matrix, np.ndarray]:
-    """The poses' equations without the points, the coupling times the points' inverse blocks, and those."""
-    index = np.arange(3)
-    points = system.points.copy()
-    points[:, index, index] *= 1.0 + damping
-    points[:, index, index] += 1e-9 * (1.0 + np.trace(points, axis1=1, axis2=2))[:, None]
-    inverse = np.linalg.inv(points)
-    poses = system.poses.copy()
-    poses[np.diag_indices_from(poses)] *= 1.0 + damping
-    poses[np.diag_indices_from(poses)] += 1e-9
-    coupling = system.coupling
-    scaled = scipy.sparse.bsr_matrix(
-        (coupling.data @ inverse[coupling.indices], coupling.indices, coupling.indptr),
-        shape=coupling.shape,
-        blocksize=(6, 3),
-    )
-    return poses - (scaled @ coupling.T).toarray(), scaled, inverse
-
-
-def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Sums [count, ...] of the rows of `values` [M, ...] that have the same `index` [M]."""
-    matrix = scipy.sparse.csr_matrix(
-        (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
-    )
-    return (matrix @ values.reshape(len(index), int(np.prod(values.shape[1:])))).reshape(
-        count, *values.shape[1:]
-    )
+    points[problem.seen.points] += point_steps(system, reduced, problem.seen, change)
+    return bundle._replace(rotations=rotations, transl=transl, points=points)

@@ -1,0 +1,275 @@
+"""Normal equations of reprojection errors with the points eliminated, for points that many frames see.
+
+A point that F frames see couples all of them: its part of the poses' equations has 36 F² numbers. Points are
+taken in batches that are seen in much the same frames. The couplings of a batch fill one dense matrix, and
+the product of that with itself, which a BLAS makes at full speed, is the batch's part. Within a batch each
+number of a small matrix is an array over the sightings, since numpy spends more time on starting products of
+small matrices than on these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+# Sightings of a batch, about: arrays over them stay in the processor's cache.
+_BATCH = 40_000
+
+_Numbers = Sequence[np.ndarray] | np.ndarray  # of a vector's or a row's coordinates, each [m]
+
+
+class Sightings(NamedTuple):
+    """What was seen where, by points of which all sightings are consecutive."""
+
+    order: np.ndarray  # [M] which sighting of the caller's each is
+    frame: np.ndarray  # [M]
+    point: np.ndarray  # [M] rank of the point
+    pixels: np.ndarray  # [2, M]
+    points: np.ndarray  # [P] the caller's number of each point that was seen at all
+    batches: list[_Batch]
+
+
+class _Batch(NamedTuple):
+    """Some points with all their sightings."""
+
+    rows: slice  # of the sightings
+    points: slice  # of the ranks
+    starts: np.ndarray  # [n] where each point's sightings begin within the batch
+    moving: np.ndarray  # [m] sightings within the batch in frames that may move
+    slots: np.ndarray  # [F] the frames that may move, as the poses' equations count them
+    slot: np.ndarray  # [m] which of these each moving sighting is in
+    point: np.ndarray  # [m] which of the batch's points it shows
+
+
+class PointPart(NamedTuple):
+    """A batch's part of the normal equations that has to do with points."""
+
+    matrix: np.ndarray  # [n, 3, 3]
+    gradient: np.ndarray  # [n, 3]
+    coupling: np.ndarray  # [6, 3, m] of moving sightings
+
+
+class System(NamedTuple):
+    """Normal equations: those of the poses, and for each batch those of its points."""
+
+    poses: np.ndarray  # [6F, 6F]
+    pose_gradient: np.ndarray  # [6F]
+    parts: list[PointPart]
+
+
+class Reduced(NamedTuple):
+    """The poses' equations without the points."""
+
+    matrix: np.ndarray  # [6F, 6F]
+    gradient: np.ndarray  # [6F]
+    inverses: list[np.ndarray]  # [n, 3, 3] of each batch's points
+
+
+def sort_sightings(frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, free: np.ndarray) -> Sightings:
+    """Sightings [M] in batches of points that are first seen in about the same frame.
+
+    Args:
+        frame, point, pixels: [M], [M] and [M, 2].
+        free: [T] bool, frames that may move.
+    """
+    points, rank = np.unique(point, return_inverse=True)
+    first = np.full(len(points), len(free))
+    np.minimum.at(first, rank, frame)
+    last = np.zeros(len(points), dtype=int)
+    np.maximum.at(last, rank, frame)
+    by_time = np.lexsort((last, first))
+    place = np.empty_like(by_time)
+    place[by_time] = np.arange(len(by_time))
+    rank = place[rank]
+    order = np.lexsort((frame, rank))
+    frame, rank = frame[order], rank[order]
+    ends = np.cumsum(np.bincount(rank, minlength=len(points)))
+    slots = np.cumsum(free) - 1
+    batches, began, row = [], 0, 0
+    while began < len(points):
+        # As many points as the batch holds, one at least.
+        until = max(int(np.searchsorted(ends, row + _BATCH, side="right")), began + 1)
+        rows = slice(row, int(ends[until - 1]))
+        here = np.flatnonzero(free[frame[rows]])
+        used, slot = np.unique(slots[frame[rows][here]], return_inverse=True)
+        starts = np.concatenate([[row], ends[began : until - 1]]) - row
+        batches.append(_Batch(rows, slice(began, until), starts, here, used, slot, rank[rows][here] - began))
+        began, row = until, rows.stop
+    return Sightings(order, frame, rank, np.ascontiguousarray(pixels[order].T), points[by_time], batches)
+
+
+def linearise(
+    seen: Sightings,
+    rotations: np.ndarray,
+    transl: np.ndarray,
+    points: np.ndarray,
+    K: np.ndarray,
+    sigma: float,
+    frames: int,
+) -> System:
+    """Normal equations under Cauchy's loss of scale `sigma` pixels.
+
+    A pose changes by a turn about the object's origin, x_cam = exp(turn) R x + t, and then by a shift.
+
+    Args:
+        seen: of T frames, of which `frames` may move.
+        rotations, transl: [T, 3, 3] and [T, 3] object to camera.
+        points: [P, 3] by rank.
+        K: [3, 3].
+        sigma: pixels.
+        frames: F.
+    """
+    poses = np.zeros((6, 6, frames))
+    gradient = np.zeros((6, frames))
+    parts = []
+    for batch in seen.batches:
+        rotation = rotations.transpose(1, 2, 0)[:, :, seen.frame[batch.rows]]
+        spoke = _times(rotation, points.T[:, seen.point[batch.rows]])
+        place = [a + b for a, b in zip(spoke, transl.T[:, seen.frame[batch.rows]], strict=True)]
+        hessian, pull = _by_place(place, seen.pixels[:, batch.rows], K, sigma)
+        turned = [_times(np.transpose(rotation, (1, 0, 2)), row) for row in hessian]  # rows of hessian @ R
+        matrix = np.empty((len(batch.starts), 3, 3))
+        by_point = np.empty((len(batch.starts), 3))
+        for i in range(3):
+            by_point[:, i] = np.add.reduceat(_dot(rotation[:, i], pull), batch.starts)
+            for j in range(i + 1):
+                values = _dot(rotation[:, i], [row[j] for row in turned])
+                matrix[:, i, j] = matrix[:, j, i] = np.add.reduceat(values, batch.starts)
+        at = batch.moving
+        arm = [a[at] for a in spoke]
+        coupling = np.empty((6, 3, len(at)))
+        for i in range(3):
+            coupling[3 + i] = [a[at] for a in turned[i]]
+        for j in range(3):
+            coupling[:3, j] = _cross(arm, coupling[3:, j])
+        parts.append(PointPart(matrix, by_point, coupling))
+        slot = batch.slots[batch.slot]
+        _add_poses(
+            poses, gradient, slot, arm, [[a[at] for a in row] for row in hessian], [a[at] for a in pull]
+        )
+    lower = np.tril_indices(6, -1)
+    poses[lower[1], lower[0]] = poses[lower]
+    whole = np.zeros((frames, 6, frames, 6))
+    diagonal = np.arange(frames)
+    whole[diagonal, :, diagonal, :] = poses.transpose(2, 0, 1)
+    return System(whole.reshape(6 * frames, 6 * frames), gradient.T.ravel(), parts)
+
+
+def _by_place(
+    place: _Numbers, pixels: np.ndarray, K: np.ndarray, sigma: float
+) -> tuple[list[list[np.ndarray]], list[np.ndarray]]:
+    """Second and first derivatives [3][3] and [3] of the losses by places in the camera's frame."""
+    z = np.where(place[2] > 1e-6, place[2], 1e-6)
+    u, v = place[0] / z, place[1] / z
+    wide, high = K[0, 0] / z, K[1, 1] / z
+    right, below = K[0, 0] * u + K[0, 2] - pixels[0], K[1, 1] * v + K[1, 2] - pixels[1]
+    weight = 1.0 / (sigma**2 + right**2 + below**2)
+    across, down = weight * wide**2, weight * high**2
+    none = np.zeros_like(u)
+    hessian = [
+        [across, none, -across * u],
+        [none, down, -down * v],
+        [-across * u, -down * v, across * u**2 + down * v**2],
+    ]
+    right, below = weight * wide * right, weight * high * below
+    return hessian, [right, below, -u * right - v * below]
+
+
+def _add_poses(
+    poses: np.ndarray,
+    gradient: np.ndarray,
+    slot: np.ndarray,
+    arm: _Numbers,
+    hessian: Sequence[Sequence[np.ndarray]],
+    pull: _Numbers,
+) -> None:
+    """Add to the lower half of the poses' blocks [6, 6, F], and to their gradient [6, F], in place.
+
+    `slot` [m] is the pose of each sighting, `arm` the spoke from the object's origin to what was seen.
+    """
+    sums = lambda values: np.bincount(slot, values, poses.shape[2])  # noqa: E731
+    levers = [_cross(arm, row) for row in hessian]  # of a shift against a turn
+    rows = [*_columns_crossed(arm, levers), *levers]
+    for i, value in enumerate((*_cross(arm, pull), *pull)):
+        gradient[i] += sums(value)
+    for i in range(6):
+        for j in range(min(i, 2) + 1):
+            poses[i, j] += sums(rows[i][j])
+    for i in range(3):
+        for j in range(i + 1):
+            poses[3 + i, 3 + j] += sums(hessian[i][j])
+
+
+def reduce(system: System, seen: Sightings, damping: float) -> Reduced:
+    """Eliminate the points, after Levenberg's and Marquardt's `damping` of all equations."""
+    frames = len(system.pose_gradient) // 6
+    matrix = system.poses.copy()
+    matrix[np.diag_indices_from(matrix)] *= 1.0 + damping
+    matrix[np.diag_indices_from(matrix)] += 1e-9
+    gradient = system.pose_gradient.copy()
+    inverses = []
+    index = np.arange(3)
+    for batch, part in zip(seen.batches, system.parts, strict=True):
+        points = part.matrix.copy()
+        points[:, index, index] *= 1.0 + damping
+        points[:, index, index] += 1e-9 * (1.0 + np.trace(points, axis1=1, axis2=2))[:, None]
+        inverse = np.linalg.inv(points)
+        inverses.append(inverse)
+        width = 6 * len(batch.slots)
+        if width == 0:
+            continue
+        dense = np.zeros((len(points), 3, width))
+        blocks = dense.reshape(len(points), 3, len(batch.slots), 6)
+        blocks[batch.point, :, batch.slot, :] = part.coupling.transpose(2, 1, 0)
+        # inverse = root rootᵀ, so that the product of one matrix with itself is all there is to do.
+        root = np.linalg.cholesky(0.5 * (inverse + inverse.transpose(0, 2, 1)))
+        scaled = (root.transpose(0, 2, 1) @ dense).reshape(-1, width)
+        columns = (6 * batch.slots[:, None] + np.arange(6)).ravel()
+        pulls = np.einsum("nji,nj->ni", root, part.gradient).ravel()
+        gradient[columns] -= scaled.T @ pulls
+        product = scaled.T @ scaled
+        if len(batch.slots) == frames:
+            matrix -= product
+        else:
+            matrix[np.ix_(columns, columns)] -= product
+    return Reduced(matrix, gradient, inverses)
+
+
+def point_steps(system: System, reduced: Reduced, seen: Sightings, change: np.ndarray) -> np.ndarray:
+    """How far every point [P, 3] goes, by rank, when the poses go by `change` [F, 6]."""
+    steps = np.zeros((len(seen.points), 3))
+    for batch, part, inverse in zip(seen.batches, system.parts, reduced.inverses, strict=True):
+        pull = part.gradient.copy()
+        step = change.T[:, batch.slots[batch.slot]]
+        for j in range(3):
+            pull[:, j] += np.bincount(batch.point, _dot(part.coupling[:, j], step), len(pull))
+        steps[batch.points] = -np.einsum("nij,nj->ni", inverse, pull)
+    return steps
+
+
+def _dot(left: _Numbers, right: _Numbers) -> np.ndarray:
+    total = left[0] * right[0]
+    for a, b in zip(left[1:], right[1:], strict=True):
+        total += a * b
+    return total
+
+
+def _times(matrix: _Numbers, vector: _Numbers) -> list[np.ndarray]:
+    """Products of matrices [3][3] and vectors [3], each number [m]."""
+    return [_dot(row, vector) for row in matrix]
+
+
+def _cross(left: _Numbers, right: _Numbers) -> list[np.ndarray]:
+    return [
+        left[1] * right[2] - left[2] * right[1],
+        left[2] * right[0] - left[0] * right[2],
+        left[0] * right[1] - left[1] * right[0],
+    ]
+
+
+def _columns_crossed(left: _Numbers, rows: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
+    """Rows of the matrix whose columns are `left` crossed with those of the matrix of `rows`."""
+    columns = [_cross(left, [row[j] for row in rows]) for j in range(3)]
+    return [[column[i] for column in columns] for i in range(3)]
