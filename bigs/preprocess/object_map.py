@@ -224,34 +224,56 @@ class ObjectMap:
         tracks, best = tracks[near], index[best[near]]
         cam = self.points[tracks] @ self.rotations[t].T + self.transl[t]
         pixels = cam[:, :2] / cam[:, 2:] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
-        free = np.flatnonzero(~taken)
-        tree = scipy.spatial.cKDTree(features.pixels[free])
-        near_by = tree.query_ball_point(pixels, config.search_radius)
-        found: dict[int, tuple[float, int]] = {}
-        for track, sighting, candidates in zip(tracks, best, near_by, strict=True):
-            if not candidates:
-                continue
-            wanted = self.features[self.frame[sighting]].descriptors[self.feature[sighting]]
-            choice = free[candidates]
-            dots = features.descriptors[choice].astype(np.float32) @ wanted.astype(np.float32) / 512.0**2
-            angles = np.arccos(np.clip(dots, -1.0, 1.0))
-            ranked = np.argsort(angles)
-            angle = float(angles[ranked[0]])
-            if angle > config.search_descriptor:
-                continue
-            if len(ranked) > 1 and angle > config.search_ratio * angles[ranked[1]]:
-                continue
-            feature = int(choice[ranked[0]])
-            if feature not in found or angle < found[feature][0]:
-                found[feature] = (angle, int(track))
-        if found:
-            new = np.array(list(found))
+        new, found = self._recognised(t, tracks, best, pixels, np.flatnonzero(~taken))
+        if len(new):
             # A sighting of another, unplaced track gives way.
             other = (self.frame == t) & np.isin(self.feature, new)
             self.good[other] = False
             self.frame = np.concatenate([self.frame, np.full(len(new), t)])
             self.feature = np.concatenate([self.feature, new])
-            self.track = np.concatenate([self.track, [track for _, track in found.values()]])
+            self.track = np.concatenate([self.track, found])
             self.pixels = np.concatenate([self.pixels, features.pixels[new]])
             self.good = np.concatenate([self.good, np.ones(len(new), dtype=bool)])
-        return len(found)
+        return len(new)
+
+    def _recognised(
+        self, t: int, tracks: np.ndarray, speaks: np.ndarray, pixels: np.ndarray, free: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Features [n] of frame `t` out of `free`, and the one of `tracks` [m] that each shows.
+
+        Args:
+            t: the frame.
+            tracks: [m] known points.
+            speaks: [m] the sighting of each that its descriptor is taken from.
+            pixels: [m, 2] where they should appear.
+            free: features that show no known point yet.
+        """
+        features, config = self.features[t], self.config
+        tree = scipy.spatial.cKDTree(features.pixels[free])
+        near = tree.query(pixels, k=_CANDIDATES, distance_upper_bound=config.search_radius)[1]
+        wanted = np.array(
+            [
+                self.features[s].descriptors[i]
+                for s, i in zip(self.frame[speaks], self.feature[speaks], strict=True)
+            ]
+        ).reshape(-1, features.descriptors.shape[1])
+        row, column = np.nonzero(near < len(free))
+        feature = free[near[row, column]]
+        dots = np.einsum(
+            "nd,nd->n", features.descriptors[feature].astype(np.float32), wanted[row].astype(np.float32)
+        )
+        angles = np.full((len(tracks), _CANDIDATES), np.inf)
+        angles[row, column] = np.arccos(np.clip(dots / 512.0**2, -1.0, 1.0))
+        least = angles.argmin(1)
+        every = np.arange(len(tracks))
+        angle = angles[every, least]
+        angles[every, least] = np.inf
+        fits = (angle < config.search_descriptor) & (angle <= config.search_ratio * angles.min(1))
+        # A feature that several points want is the one's that it is most like.
+        order = np.flatnonzero(fits)[np.argsort(angle[fits], kind="stable")]
+        new, first = np.unique(free[near[order, least[order]]], return_index=True)
+        return new, tracks[order[first]]
+
+
+# Features near where a point should appear that are looked at.
+_CANDIDATES = 16

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Sightings of a batch, about: arrays over them stay in the processor's cache.
-_BATCH = 40_000
+# Least sightings of a batch: few enough for arrays over them to stay in the processor's cache.
+_BATCH = 8_000
 
 _Numbers = Sequence[np.ndarray] | np.ndarray  # of a vector's or a row's coordinates, each [m]
 
@@ -89,8 +89,9 @@ def sort_sightings(frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, fre
     slots = np.cumsum(free) - 1
     batches, began, row = [], 0, 0
     while began < len(points):
-        # As many points as the batch holds, one at least.
-        until = max(int(np.searchsorted(ends, row + _BATCH, side="right")), began + 1)
+        # As many points as frames, too: a batch's part is added to all pairs of its frames.
+        until = max(int(np.searchsorted(ends, row + _BATCH)) + 1, began + len(free))
+        until = min(until, len(points))
         rows = slice(row, int(ends[until - 1]))
         here = np.flatnonzero(free[frame[rows]])
         used, slot = np.unique(slots[frame[rows][here]], return_inverse=True)

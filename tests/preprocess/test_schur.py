@@ -54,7 +54,7 @@ def full_equations(bundle: Bundle, free: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
 @pytest.mark.parametrize("still", [(), (0, 3)])
-@pytest.mark.parametrize("batch", [40_000, 16])
+@pytest.mark.parametrize("batch", [8_000, 16])
 def test_points_are_eliminated_exactly(
     share: float, still: tuple[int, ...], batch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
