@@ -44,6 +44,7 @@ COMMANDS: Commands = {
     "ablate": runs.ablate,
     "prior": {"fit": prior.prior_fit, "train": prior.prior_train},
     "bench": {
+        "adjustment": bench.bench_adjustment,
         "engine": bench.bench_engine,
         "preprocess": bench.bench_preprocess,
         "reconstruct": bench.bench_reconstruct,

@@ -157,3 +157,33 @@ def bench_robustness(
         found = run(plan, out, status.update)
     print_tables(found.tables, out)
     fail_for(found.failed)
+
+
+def bench_adjustment(
+    out: Path = Path("bench"),
+    frames: tuple[int, ...] = (60, 300),
+    points: tuple[int, ...] = (1000, 7000),
+    seen: tuple[int, ...] = (0, 20),
+    iterations: int = 15,
+    seed: int = 0,
+    threads: int = 0,
+) -> None:
+    """Time bundle adjustment of simulated objects against frames, points, and how many frames see a point.
+
+    Args:
+        out: folder for adjustment.md and adjustment.json.
+        frames: numbers of frames.
+        points: numbers of points.
+        seen: in how many consecutive frames a point is seen; 0 is all.
+        iterations: of each adjustment.
+        seed: of the objects.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.bench_adjustment import AdjustmentPlan
+    from bigs.commands.bench_adjustment import bench_adjustment as run
+
+    plan = AdjustmentPlan(frames, points, seen, iterations, seed)
+    with stderr.status("starting") as status:
+        tables = run(plan, out, status.update)
+    print_tables(tables, out)
