@@ -162,7 +162,7 @@ def test_ingredients_are_left_out(
         ("stages.joint.image_size=-2", ["image_size", "expected", "found -2"]),
         ("stages.object-scale-search.candidates=0", ["candidates", "expected", "found 0"]),
         ("initial.surface_resolution=0", ["surface_resolution", "expected", "found 0"]),
-        ("initial.surface_kept=0", ["surface_kept", "expected 0.01 or more", "found 0"]),
+        ("initial.surface_kept=0", ["surface_kept", "expected 0.01 to", "found 0"]),
         ("object.n_gaussians=0", ["n_gaussians", "expected", "found 0"]),
         ("checkpoint_every=0", ["checkpoint_every", "expected", "found 0"]),
     ],

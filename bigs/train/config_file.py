@@ -12,8 +12,12 @@ from typing import Any
 import yaml
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 from bigs.train.config import RunConfig
+from bigs.train.ranges import check_ranges
+
+# So much of a change shows in a message.
+_SHOWN = 80
 
 
 def to_plain(config: Any) -> Any:
@@ -32,9 +36,11 @@ def from_plain(plain: Any, where: str = "config") -> RunConfig:
     """Build a `RunConfig` from plain data.
 
     Raises:
-        InputError: an unknown key or a value of the wrong type, named by its path.
+        InputError: an unknown key, a value of the wrong type or a number out of range, named by its path.
     """
-    return _build(RunConfig, plain, where)
+    config: RunConfig = _build(RunConfig, plain, where)
+    check_ranges(where, config)
+    return config
 
 
 def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
@@ -71,9 +77,12 @@ def _scalar(change: str, text: str) -> Any:
     """A value as YAML reads it, except that 1e-3 is a number, too."""
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        # ValueError comes of integers of thousands of digits and of days that no month has.
         reason = str(error).splitlines()[0]
-        raise InputError(f"--set {change}: expected a value, found {text!r} ({reason})") from error
+        raise InputError(
+            f"--set {change[:_SHOWN]}: expected a value, found {shown(text)} ({reason})"
+        ) from error
     if isinstance(value, str):
         try:
             return float(value)
@@ -99,7 +108,7 @@ def load_config(path: Path) -> RunConfig:
         data = yaml.safe_load(path.read_text())
     except OSError as error:
         raise InputError(f"{path}: expected a configuration file, found none ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from error
     if not isinstance(data, dict) or "config" not in data:
         raise InputError(f"{path}: expected a key 'config', found {type(data).__name__} without it")
@@ -115,18 +124,26 @@ def _build(kind: Any, plain: Any, where: str) -> Any:
         return None if plain is None else _build(arguments[0], plain, where)
     if origin is typing.Literal:
         if plain not in arguments:
-            raise InputError(f"{where}: expected one of {', '.join(map(str, arguments))}, found {plain!r}")
+            raise InputError(
+                f"{where}: expected one of {', '.join(map(str, arguments))}, found {shown(plain)}"
+            )
         return plain
     if origin is tuple:
         return _build_tuple(arguments, plain, where)
     if origin is dict:
         if not isinstance(plain, dict):
-            raise InputError(f"{where}: expected a mapping, found {plain!r}")
-        return {str(key): _build(arguments[1], value, f"{where}.{key}") for key, value in plain.items()}
+            raise InputError(f"{where}: expected a mapping, found {shown(plain)}")
+        for key in plain:
+            if not isinstance(key, str):
+                raise InputError(f"{where}: expected names as keys, found {shown(key)}")
+        return {key: _build(arguments[1], value, f"{where}.{key}") for key, value in plain.items()}
     if kind is float and isinstance(plain, int) and not isinstance(plain, bool):
-        return float(plain)
+        try:
+            return float(plain)
+        except OverflowError:
+            raise InputError(f"{where}: expected a number, found {shown(plain)}") from None
     if not isinstance(plain, kind) or (kind in (int, float) and isinstance(plain, bool)):
-        raise InputError(f"{where}: expected {kind.__name__}, found {plain!r}")
+        raise InputError(f"{where}: expected {kind.__name__}, found {shown(plain)}")
     return plain
 
 
@@ -134,17 +151,17 @@ def _build_tuple(arguments: tuple[Any, ...], plain: Any, where: str) -> tuple[An
     item = arguments[0]
     if isinstance(item, types.UnionType):  # the stages of a plan
         if not isinstance(plain, dict):
-            raise InputError(f"{where}: expected stages by name, found {plain!r}")
+            raise InputError(f"{where}: expected stages by name, found {shown(plain)}")
         return tuple(_build_stage(item, name, stage, f"{where}.{name}") for name, stage in plain.items())
     if not isinstance(plain, list | tuple) or (arguments[-1] is not ... and len(plain) != len(arguments)):
         wanted = "a list" if arguments[-1] is ... else f"{len(arguments)} values"
-        raise InputError(f"{where}: expected {wanted}, found {plain!r}")
+        raise InputError(f"{where}: expected {wanted}, found {shown(plain)}")
     return tuple(_build(item, value, f"{where}[{i}]") for i, value in enumerate(plain))
 
 
 def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> Any:
     if not isinstance(plain, dict):
-        raise InputError(f"{where}: expected a stage, found {plain!r}")
+        raise InputError(f"{where}: expected a stage, found {shown(plain)}")
     first, *others = typing.get_args(kinds)
     common = {f.name for f in dataclasses.fields(first)}
     kind = next(
@@ -155,11 +172,11 @@ def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> A
 
 def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
     if not isinstance(plain, dict):
-        raise InputError(f"{where}: expected a mapping, found {plain!r}")
+        raise InputError(f"{where}: expected a mapping, found {shown(plain)}")
     hints = typing.get_type_hints(kind)
     for key in plain:
         if key not in hints:
-            raise InputError(f"{where}: expected keys out of {', '.join(hints)}, found {key!r}")
+            raise InputError(f"{where}: expected keys out of {', '.join(hints)}, found {shown(key)}")
     required = [
         f.name
         for f in dataclasses.fields(kind)
@@ -167,5 +184,5 @@ def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
     ]
     for key in required:
         if key not in plain:
-            raise InputError(f"{where}: expected a key {key!r}, found {', '.join(plain) or 'nothing'}")
+            raise InputError(f"{where}: expected a key {shown(key)}, found {', '.join(plain) or 'nothing'}")
     return kind(**{key: _build(hints[key], value, f"{where}.{key}") for key, value in plain.items()})

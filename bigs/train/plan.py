@@ -2,44 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
 
 from bigs.checks import InputError
 from bigs.train.config import (
     CompletionStage,
-    GraspStage,
     GuidanceStage,
     OptimizeStage,
     RunConfig,
-    ScaleSearchStage,
     SplitStage,
     Stage,
 )
 from bigs.train.density import DensifyConfig
 from bigs.train.optim import GROUPS
+from bigs.train.ranges import check_ranges
 from bigs.train.terms import IMAGE_TERMS, TERMS
 
-# The least value of every number that has one, by its path in the configuration, or in a kind of stage.
-_LEAST = {
-    "checkpoint_every": 1,
-    "initial.surface_resolution": 8,
-    "initial.surface_agreeing": 1,
-    "initial.seen_frames": 1,
-    "initial.surface_solid": 0.0,
-    "initial.surface_kept": 0.01,
-    "object.n_gaussians": 10,
-    "hand.subdivisions": 0,
-    "raster.eps2d": 0.0,
-}
-_LEAST_OF_STAGE: Mapping[type, Mapping[str, float]] = {
-    OptimizeStage: {"steps": 0, "image_size": 0, "frames_per_step": 0},
-    ScaleSearchStage: {"candidates": 1, "image_size": 0, "frames": 1},
-    GraspStage: {"speed": 0.0, "least": 2, "slack": 0.0, "bridge": 0, "longest_move": 0},
-    SplitStage: {"parts": 1, "least_opacity": 0.0},
-    CompletionStage: {"most_worsening": 0.0},
-    GuidanceStage: {"steps": 0, "views": 1, "image_size": 16, "damage": 0.0, "hold": 0.0, "unlike": 0.0},
-}
 # What the renderer is compiled for.
 COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}
 
@@ -56,10 +34,9 @@ def check_plan(config: RunConfig) -> None:
     repeated = {name for name in names if names.count(name) > 1}
     if repeated:
         raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
-    _check_numbers("config ", config, _LEAST)
+    check_ranges("config", config)
     for stage in config.stages:
         where = f"config stages.{stage.name}"
-        _check_numbers(f"{where}.", stage, _LEAST_OF_STAGE[type(stage)])
         if isinstance(stage, OptimizeStage):
             _check_names(where, stage)
             for name, given in (("free_frames", stage.free_frames), ("densify", stage.densify is not None)):
@@ -107,12 +84,3 @@ def _check_densify(
             raise InputError(f"{where}: expected {' <= '.join(order)}, found {found}")
     if config.every <= 0.0:
         raise InputError(f"{where}.every: expected more than 0, found {config.every}")
-
-
-def _check_numbers(where: str, owner: object, least: Mapping[str, float]) -> None:
-    for path, lowest in least.items():
-        value = owner
-        for name in path.split("."):
-            value = getattr(value, name)
-        if value < lowest:
-            raise InputError(f"{where}{path}: expected {lowest} or more, found {value}")

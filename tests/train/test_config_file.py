@@ -173,7 +173,7 @@ def test_the_last_change_of_a_path_wins(smoke: RunConfig) -> None:
 def test_what_is_changed_is_a_copy(smoke: RunConfig) -> None:
     """Presets share stages with each other; a change in one run must not reach the next."""
     with_changes(
-        smoke, ["stages.joint.lrs.hand.ray=9", "stages.joint.weights.mask=9", "hand.color=[0, 0, 0]"]
+        smoke, ["stages.joint.lrs.hand.ray=9", "stages.joint.weights.mask=9", "hand.color=[0.1, 0.1, 0.1]"]
     )
     assert smoke == PRESETS["smoke"]
 
