@@ -39,7 +39,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "data": BELOW | {"geometry", "colmap"},
     "metrics": BELOW | {"geometry"},
     "export": BELOW | {"geometry"},
-    "preprocess": BELOW | {"geometry", "hand", "data", "colmap"},
+    "motion": BELOW | {"geometry", "colmap"},
+    "preprocess": BELOW | {"geometry", "hand", "data", "colmap", "motion"},
     "viewer": {"types", "checks", "atomic"},
     "models": BELOW | {"geometry", "hand", "fields"},
 }
@@ -52,6 +53,7 @@ MAY_IMPORT["train"] = {
     "data",
     "metrics",
     "models",
+    "motion",
 }
 MAY_IMPORT["bench"] = BELOW | {"bigs", "raster", "_raster"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT) - {"_raster"}

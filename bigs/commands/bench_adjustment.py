@@ -17,7 +17,7 @@ from bigs.bench.machine import machine_facts
 from bigs.bench.page import Rows, Table, page
 from bigs.checks import InputError
 from bigs.commands.run_folder import write_json
-from bigs.preprocess.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.bundle import Bundle, BundleConfig, adjust
 
 PAGE = "adjustment.md"
 NUMBERS = "adjustment.json"

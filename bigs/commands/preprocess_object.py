@@ -15,6 +15,7 @@ from bigs.commands.preprocess_pictures import with_points, with_skeletons, write
 from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome, kept
 from bigs.data.images import read_image, read_mask
 from bigs.hand import load_hand_models
+from bigs.motion.models import MappingConfig
 from bigs.preprocess.align import AlignConfig, align
 from bigs.preprocess.artefacts import (
     ALIGNED_FILE,
@@ -41,7 +42,6 @@ from bigs.preprocess.artefacts import (
 from bigs.preprocess.hands import joints_of_track
 from bigs.preprocess.sfm import SfmConfig, SfmReport, structure_from_motion
 from bigs.preprocess.sfm_learned import load_matcher
-from bigs.preprocess.sfm_models import MappingConfig
 from bigs.types import Side
 
 # What structure from motion has to say of every frame.

@@ -9,19 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from bigs.checks import InputError
+from bigs.motion.features import FeatureConfig, FrameFeatures, extract_features
+from bigs.motion.follow import FollowConfig, follow
+from bigs.motion.grow import GrowConfig, grow
+from bigs.motion.models import Mapping, MappingConfig, frame_pairs, map_features
+from bigs.motion.object_map import MapConfig, ObjectMap
+from bigs.motion.patches import PatchConfig, Pictures, sharpen
+from bigs.motion.refine import RefineConfig, refine
+from bigs.motion.seed import Seed, find_seed
+from bigs.motion.tracks import Tracks, join_matches
 from bigs.preprocess.artefacts import ObjectSfm
-from bigs.preprocess.object_map import MapConfig, ObjectMap
 from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
-from bigs.preprocess.sfm_features import FeatureConfig, FrameFeatures, extract_features
-from bigs.preprocess.sfm_follow import FollowConfig, follow
-from bigs.preprocess.sfm_grow import GrowConfig, grow
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
-from bigs.preprocess.sfm_models import Mapping, MappingConfig, frame_pairs, map_features
-from bigs.preprocess.sfm_patches import PatchConfig, Pictures, sharpen
 from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
-from bigs.preprocess.sfm_refine import RefineConfig, refine
-from bigs.preprocess.sfm_seed import Seed, find_seed
-from bigs.preprocess.tracks import Tracks, join_matches
 from bigs.preprocess.words import frame_ranges
 from bigs.types import MASK_VALUES
 

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.bundle import turn_uncertainties
-from bigs.preprocess.object_map import MapConfig, ObjectMap
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_refine import disagreement, joined, smooth_parts
-from bigs.preprocess.sfm_seed import evidence, mirror_evidence, mirrored
-from bigs.preprocess.tracks import Tracks
+from bigs.motion.bundle import turn_uncertainties
+from bigs.motion.features import FrameFeatures
+from bigs.motion.models import PartialModel
+from bigs.motion.object_map import MapConfig, ObjectMap
+from bigs.motion.refine import disagreement, joined, smooth_parts
+from bigs.motion.seed import evidence, mirror_evidence, mirrored
+from bigs.motion.tracks import Tracks
 
 
 @dataclass(frozen=True)

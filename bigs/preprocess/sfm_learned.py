@@ -12,7 +12,7 @@ from kornia.feature import DISK, LightGlue
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.preprocess.sfm_features import NOTHING, FeatureConfig, FrameFeatures, crop_box, enlargement
+from bigs.motion.features import NOTHING, FeatureConfig, FrameFeatures, crop_box, enlargement
 
 # DISK's network halves its input four times.
 _MULTIPLE = 16

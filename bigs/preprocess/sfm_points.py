@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bigs.preprocess.object_map import ObjectMap
+from bigs.motion.object_map import ObjectMap
 
 
 def trim_points(points: np.ndarray) -> np.ndarray:

@@ -15,10 +15,10 @@ from bigs.checks import InputError
 from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import load_hand_models
+from bigs.motion.features import FrameFeatures
+from bigs.motion.follow import FollowConfig, Matches
+from bigs.motion.models import Mapping, MappingConfig, map_features
 from bigs.preprocess.sfm import SfmConfig, structure_from_motion
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.sfm_follow import FollowConfig, Matches
-from bigs.preprocess.sfm_models import Mapping, MappingConfig, map_features
 from bigs.preprocess.sfm_points import normalisation, trim_points
 
 FRAMES = 20

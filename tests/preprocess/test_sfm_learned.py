@@ -11,9 +11,9 @@ from kornia.feature import DISK, LightGlue
 from turning_object import K, turning_object
 
 from bigs.checks import InputError
-from bigs.preprocess.sfm_features import FeatureConfig
+from bigs.motion.features import FeatureConfig
+from bigs.motion.models import MappingConfig, frame_pairs, map_features
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, load_matcher, match_learned
-from bigs.preprocess.sfm_models import MappingConfig, frame_pairs, map_features
 
 
 @pytest.fixture(scope="module")

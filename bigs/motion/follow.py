@@ -13,8 +13,8 @@ import numpy as np
 import scipy.spatial
 import torch
 
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.sfm_patches import Laid, PatchConfig, Pictures, cut_templates, lay, patch_offsets
+from bigs.motion.features import FrameFeatures
+from bigs.motion.patches import Laid, PatchConfig, Pictures, cut_templates, lay, patch_offsets
 
 
 @dataclass(frozen=True)

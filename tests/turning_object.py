@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.object_map import MapConfig, ObjectMap
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.tracks import Tracks, join_matches
+from bigs.motion.features import FrameFeatures
+from bigs.motion.models import PartialModel
+from bigs.motion.object_map import MapConfig, ObjectMap
+from bigs.motion.tracks import Tracks, join_matches
 
 K = np.array([[1000.0, 0.0, 240.0], [0.0, 1000.0, 180.0], [0.0, 0.0, 1.0]])
 AXES = np.array([0.05, 0.09, 0.035])

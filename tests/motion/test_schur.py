@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from turning_object import K
 
-import bigs.preprocess.schur as schur
-from bigs.preprocess.bundle import Bundle
+import bigs.motion.schur as schur
+from bigs.motion.bundle import Bundle
 
 SIGMA = 0.5
 

@@ -10,7 +10,7 @@ import pytest
 from filmed_egg import WIDTH, film
 from turning_object import AXES, K, TurningObject, turning_object
 
-from bigs.preprocess.sfm_follow import FollowConfig, Matches, follow
+from bigs.motion.follow import FollowConfig, Matches, follow
 
 FRAMES = 8
 CONFIG = FollowConfig()

@@ -9,7 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from turning_object import TurningObject, rotation_errors, turning_object
 
-from bigs.preprocess.object_map import ObjectMap
+from bigs.motion.grow import GrowConfig, as_models_say, best_start, grow
+from bigs.motion.object_map import ObjectMap
+from bigs.motion.refine import RefineConfig, disagreement, polish, refine, smooth_parts, splices
+from bigs.motion.seed import find_seed, smooth_runs
+from bigs.motion.tracks import join_matches
 from bigs.preprocess.sfm_checks import (
     FEW,
     LOOSE,
@@ -20,10 +24,6 @@ from bigs.preprocess.sfm_checks import (
     check_map,
     turn_cosines,
 )
-from bigs.preprocess.sfm_grow import GrowConfig, as_models_say, best_start, grow
-from bigs.preprocess.sfm_refine import RefineConfig, disagreement, polish, refine, smooth_parts, splices
-from bigs.preprocess.sfm_seed import find_seed, smooth_runs
-from bigs.preprocess.tracks import join_matches
 
 FLIP = np.diag([1.0, 1.0, -1.0])
 

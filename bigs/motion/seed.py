@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.object_map import ObjectMap
-from bigs.preprocess.sfm_models import PartialModel
+from bigs.motion.models import PartialModel
+from bigs.motion.object_map import ObjectMap
 
 _FLIP = np.diag([1.0, 1.0, -1.0])
 

@@ -17,10 +17,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bigs.geometry.rotations import robust_mean_rotation
-from bigs.preprocess.object_map import ObjectMap
-from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_seed import smooth_runs
-from bigs.preprocess.tracks import Tracks
+from bigs.motion.models import PartialModel
+from bigs.motion.object_map import ObjectMap
+from bigs.motion.seed import smooth_runs
+from bigs.motion.tracks import Tracks
 
 
 @dataclass(frozen=True)

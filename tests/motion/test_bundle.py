@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
-from bigs.preprocess.bundle import Bundle, BundleConfig, adjust, turn_uncertainties
+from bigs.motion.bundle import Bundle, BundleConfig, adjust, turn_uncertainties
 
 
 @pytest.fixture(scope="module")

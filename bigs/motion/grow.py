@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.bundle import BundleConfig
-from bigs.preprocess.object_map import ObjectMap
-from bigs.preprocess.sfm_models import PartialModel
-from bigs.preprocess.sfm_refine import joined
+from bigs.motion.bundle import BundleConfig
+from bigs.motion.models import PartialModel
+from bigs.motion.object_map import ObjectMap
+from bigs.motion.refine import joined
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bigs.colmap import pycolmap
-from bigs.preprocess.sfm_features import FrameFeatures, quiet_colmap
+from bigs.motion.features import FrameFeatures, quiet_colmap
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from bigs.preprocess.schur import Sightings, System, linearise, point_steps, reduce, sort_sightings
+from bigs.motion.schur import Sightings, System, linearise, point_steps, reduce, sort_sightings
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from filmed_egg import WIDTH, film
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
-from bigs.preprocess.object_map import MapConfig, ObjectMap
-from bigs.preprocess.sfm_patches import PatchConfig, Pictures, sharpen
+from bigs.motion.object_map import MapConfig, ObjectMap
+from bigs.motion.patches import PatchConfig, Pictures, sharpen
 
 
 class Filmed(NamedTuple):

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.spatial
 
-from bigs.preprocess.bundle import Bundle, BundleConfig, adjust
-from bigs.preprocess.sfm_features import FrameFeatures
-from bigs.preprocess.tracks import Tracks
+from bigs.motion.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.features import FrameFeatures
+from bigs.motion.tracks import Tracks
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ import torch
 from PIL import Image
 
 from bigs.geometry.surface import point_normals
-from bigs.preprocess.object_map import ObjectMap
-from bigs.preprocess.sfm_features import crop_box
+from bigs.motion.features import crop_box
+from bigs.motion.object_map import ObjectMap
 
 
 @dataclass(frozen=True)
