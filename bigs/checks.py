@@ -26,6 +26,8 @@ ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
 )
 
 
+# Of a picture: twice as many as 8K video has. One takes 200 MB as bytes of three colours.
+MAX_PIXELS = 1 << 26
 # Rotations are kept in float32 and in print with six digits.
 ROTATION_TOLERANCE = 1e-3
 # How much of a value from a file a message shows.
@@ -91,6 +93,12 @@ def check_faces(name: str, faces: Any, vertex_count: int) -> None:
         )
 
 
+def check_pixels(name: str, width: int, height: int, most: int = MAX_PIXELS) -> None:
+    """Raise `InputError` unless a picture of `width` x `height` has at most `most` pixels."""
+    if width * height > most:
+        raise InputError(f"{name}: expected at most {most} pixels, found {width} x {height}")
+
+
 def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Raise `InputError` unless `value` is one of `choices`."""
     accepted = list(choices)
@@ -106,6 +114,8 @@ def shown(value: Any) -> str:
     """
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * _SHOWN:
         return f"an integer of about {math.ceil(value.bit_length() * math.log10(2))} digits"
+    if isinstance(value, np.ndarray | torch.Tensor) and math.prod(value.shape) > 16:
+        return f"an array of shape {list(value.shape)}"
     try:
         text = " ".join(_BRIEFLY.repr(value).split())
     except Exception:  # a value may raise whatever it likes

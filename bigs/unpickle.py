@@ -19,7 +19,9 @@ import numpy as np
 import scipy.sparse
 import torch
 
+from bigs.archives import npy_header, read_array
 from bigs.checks import InputError
+from bigs.files import open_regular
 from bigs.pickle_records import (
     ARRAYS,
     CHUMPY,
@@ -72,32 +74,18 @@ def load_npy(path: str | Path, *, allow: frozenset[Global] = TENSORS) -> Any:
     Raises:
         InputError: there is no such file, or it is not an .npy file, or `restricted_load` refuses it.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: expected an .npy file, found nothing")
-    with path.open("rb") as file:
-        try:
-            dtype = _npy_dtype(file)
-            if not dtype.hasobject:
-                file.seek(0)
-                return np.load(file, allow_pickle=False)
-        except Exception as error:  # the header is parsed as a literal; damage shows up in many ways
-            raise InputError(f"{path}: expected an .npy file, found: {error}") from error
+    with open_regular(path, "an .npy file") as file:
+        _, dtype = npy_header(str(path), file)
+        if not dtype.hasobject:
+            size = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            return read_array(str(path), file, size)
         if dtype != np.dtype(object):
             raise InputError(f"{path}: expected an array of numbers or of objects, found dtype {dtype}")
         array = restricted_load(file, name=str(path), allow=allow)
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: expected a pickled object array, found {type(array).__name__}")
     return array.item() if array.shape == () else array
-
-
-def _npy_dtype(file: BinaryIO) -> np.dtype:
-    """The dtype in an .npy header; leaves `file` at the first byte after the header."""
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(file)
-    if version not in readers:
-        raise ValueError(f"format version {version}")
-    return readers[version](file)[2]
 
 
 class _Builder:

@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from bigs.checks import InputError, check_finite, check_shape
+from bigs.files import check_regular
 
 # What torch raises for files that are no checkpoint, are cut short, or hold more than plain data.
 _UNREADABLE = (
@@ -36,12 +37,11 @@ def load_weights(path: Path, network: str) -> dict[str, Tensor]:
     Raises:
         InputError: the file is missing or unreadable, or holds other things than tensors by name.
     """
+    check_regular(path, f"a file with {network}")
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise InputError(f"{path}: expected a file with {network}, found none ({error.strerror})") from error
     except _UNREADABLE as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(

@@ -18,17 +18,20 @@ ROOT = Path(bigs.__file__).parent
 
 # A part is a top-level module or package of bigs; "bigs" itself is its version. Each may import itself and
 # what its entry names. Siblings are apart; what they share lies below them.
-BELOW = {"types", "checks", "checksum", "atomic", "unpickle", "weights"}
+BELOW = {"types", "checks", "names", "files", "archives", "checksum", "atomic", "unpickle", "weights"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bigs": set(),
     "types": set(),
     "checks": set(),
     "checksum": set(),
+    "names": {"checks"},
+    "files": {"checks"},
+    "archives": {"checks", "files"},
     "colmap": set(),
     "atomic": set(),
     "pickle_records": set(),
-    "unpickle": {"checks", "pickle_records"},
-    "weights": {"checks"},
+    "unpickle": {"checks", "files", "archives", "pickle_records"},
+    "weights": {"checks", "files"},
     "_raster": {"raster"},  # the compiled module's stub names the settings class
     "geometry": BELOW,
     "raster": BELOW | {"geometry", "_raster"},

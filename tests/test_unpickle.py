@@ -264,7 +264,7 @@ def test_npy_of_an_object_gives_the_object(tmp_path: Path) -> None:
 
 def test_npy_errors_name_the_file(tmp_path: Path) -> None:
     path = tmp_path / "data.npy"
-    with pytest.raises(InputError, match=r"data\.npy: expected an \.npy file, found nothing"):
+    with pytest.raises(InputError, match=r"data\.npy: expected an \.npy file, found no such file"):
         load_npy(path)
     path.write_text("not an array, but long enough for a header" * 5)
     with pytest.raises(InputError, match=r"data\.npy"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import time
@@ -18,6 +17,7 @@ from bigs.checks import InputError
 from bigs.commands.reconstruct import reconstruct
 from bigs.commands.run_folder import CONFIG, METRICS, SCENE, write_json
 from bigs.commands.series import PlannedRun
+from bigs.files import read_json
 
 STATUS = "status.json"
 JOB_LOG = "batch.log"
@@ -57,9 +57,9 @@ class Status:
 def read_status(folder: Path) -> Status:
     """The status of a clip; "waiting" where there is none, or none that can be read."""
     try:
-        stored = json.loads((folder / STATUS).read_text())
+        stored = read_json(folder / STATUS)
         return Status(**{name.name: stored[name.name] for name in fields(Status)})
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, KeyError, TypeError):
         return Status()
 
 
@@ -127,7 +127,7 @@ def run_job(job: Job) -> None:
     if error:
         write_status(folder, Status(**done | {"state": "failed", "error": error, "again": again}))
     else:
-        scores = json.loads((folder / METRICS).read_text()).get("result", {})
+        scores = read_json(folder / METRICS).get("result", {})
         write_status(folder, Status(**done | {"state": "finished", "scores": scores}))
 
 

@@ -24,6 +24,7 @@ from bigs.commands.run_folder import write_json
 from bigs.commands.series import PlannedRun, check_folders, run_or_reuse
 from bigs.commands.truth import find_ground_truth
 from bigs.data.ground_truth import load_ground_truth
+from bigs.files import read_json
 from bigs.hand import load_hand_models
 from bigs.train.config import RunConfig
 from bigs.train.config_file import to_plain
@@ -215,8 +216,8 @@ def bench_reconstruct(
 def _stored(path: Path, key: dict[str, Any]) -> dict[str, Any] | None:
     """What an earlier call has measured of the same thing."""
     try:
-        stored = json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError):
+        stored = read_json(path)
+    except InputError:
         return None
     return stored["found"] if stored["of"] == key else None
 

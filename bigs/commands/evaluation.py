@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from bigs.commands.run_folder import METRICS, load_run, write_json
 from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
 from bigs.data.base import Clip
 from bigs.data.novel import CAMERAS
+from bigs.files import read_json
 from bigs.hand import HandModel, load_hand_models
 from bigs.losses.perceptual import VggWeights, perceptual_distance
 from bigs.losses.perceptual_file import load_perceptual_weights
@@ -128,7 +128,7 @@ def evaluate_run(
         remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")
     remarks += _told_once(told)
     path = run / METRICS
-    scores = json.loads(path.read_text()) if path.exists() else {}
+    scores = read_json(path, "a run's scores") if path.exists() else {}
     scores["result"] = scores.get("result", {}) | result
     write_json(path, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from bigs.checks import InputError, check_choice
+from bigs.checks import InputError, check_choice, shown
+from bigs.files import MAX_TEXT_BYTES, MAX_YAML_BYTES, parse_json, parse_yaml, read_text
+from bigs.names import check_name, check_path
 
 SUFFIXES = (".yaml", ".yml", ".json", ".csv", ".txt")
 # What separates several values in a cell of a CSV file.
@@ -50,12 +49,8 @@ def read_manifest(path: Path) -> list[Entry]:
             name that comes twice.
     """
     check_choice(f"{path}: suffix", path.suffix.lower(), SUFFIXES)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: expected a manifest, found no such file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected text, found other bytes") from None
+    most = MAX_YAML_BYTES if path.suffix.lower() in (".yaml", ".yml") else MAX_TEXT_BYTES
+    text = read_text(path, "a manifest", most)
     rows = [_entry(f"{path}: entry {i}", row, path.parent) for i, row in enumerate(_rows(path, text), 1)]
     if not rows:
         raise InputError(f"{path}: expected at least one clip, found none")
@@ -71,20 +66,16 @@ def _rows(path: Path, text: str) -> Sequence[Any]:
         table = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
         # A row that is longer than the heading has its rest under None.
         return [{key or "more cells": cell for key, cell in row.items() if cell} for row in table]
-    try:
-        document = json.loads(text) if kind == ".json" else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: expected {kind[1:].upper()}, found: {reason}") from None
+    document = parse_json(str(path), text) if kind == ".json" else parse_yaml(str(path), text)
     defaults: Mapping[str, Any] = {}
     if isinstance(document, dict):
         other = set(document) - {"clips", "defaults"}
         if other:
-            raise InputError(f"{path}: expected clips and defaults, found {sorted(map(str, other))[0]}")
+            raise InputError(f"{path}: expected clips and defaults, found {shown(next(iter(other)))}")
         defaults = document.get("defaults") or {}
         document = document.get("clips")
         if not isinstance(defaults, dict):
-            raise InputError(f"{path}: defaults: expected fields and values, found {defaults!r}")
+            raise InputError(f"{path}: defaults: expected fields and values, found {shown(defaults)}")
     if not isinstance(document, list):
         raise InputError(f"{path}: expected a list of clips, found {type(document).__name__}")
     return [_with_defaults(defaults, row if isinstance(row, dict) else {"clip": row}) for row in document]
@@ -110,17 +101,21 @@ def _entry(where: str, row: Any, folder: Path) -> Entry:
         if key in _LISTS:
             parts = value.split(_SEPARATOR) if isinstance(value, str) else value
             if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
-                raise InputError(f"{where}: {key}: expected a list of texts, found {value!r}")
+                raise InputError(f"{where}: {key}: expected a list of texts, found {shown(value)}")
             values[key] = tuple(part.strip() for part in parts if part.strip())
         elif not isinstance(value, str) or not value:
-            raise InputError(f"{where}: {key}: expected text, found {value!r}")
+            raise InputError(f"{where}: {key}: expected text, found {shown(value)}")
         elif key in _PATHS:
-            values[key] = folder / value
+            values[key] = folder / check_path(f"{where}: {key}", value)
     if "clip" not in values:
         raise InputError(f"{where}: expected a field clip, found {', '.join(values) or 'nothing'}")
     name = values.get("name", "")
     if name and (not re.fullmatch(r"[\w.+-]+", name) or name.startswith(".")):
-        raise InputError(f"{where}: name: expected letters, digits, '.', '+', '-' and '_', found {name!r}")
+        raise InputError(
+            f"{where}: name: expected letters, digits, '.', '+', '-' and '_', found {shown(name)}"
+        )
+    if name:
+        check_name(f"{where}: name", name)
     return Entry(**values)
 
 
@@ -141,6 +136,6 @@ def _named(path: Path, entries: Sequence[Entry]) -> list[Entry]:
             while name in taken:
                 number += 1
                 name = f"{base}_{number}"
-            taken.add(name)
+            taken.add(check_name(f"{path}: {entry.clip}: name", name))
         named.append(replace(entry, name=name))
     return named

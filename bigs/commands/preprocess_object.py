@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from bigs.checks import InputError
 from bigs.commands.preprocess_pictures import with_points, with_skeletons, write_sheet
 from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome, kept
 from bigs.data.images import read_image, read_mask
+from bigs.files import read_json
 from bigs.hand import load_hand_models
 from bigs.motion.models import MappingConfig
 from bigs.preprocess.align import AlignConfig, align
@@ -145,7 +145,7 @@ def _with_focal(processed: Path, frames: FrameSet, focal: float) -> tuple[FrameS
     """`frames.json` with the estimated focal length, and a sentence about it."""
     K = frames.K.copy()
     K[0, 0], K[1, 1] = focal, focal * K[1, 1] / K[0, 0]
-    stored = json.loads((processed / "frames.json").read_text(encoding="utf-8"))
+    stored = read_json(processed / "frames.json")
     changed = replace(frames, K=K, camera="estimated from the object's motion")
     write_frame_set(processed, changed, str(stored.get("inputs", "")))
     note = (

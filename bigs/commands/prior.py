@@ -18,6 +18,7 @@ from bigs.bench.machine import largest_so_far
 from bigs.checks import InputError
 from bigs.commands.clips import open_clip
 from bigs.data.base import Clip
+from bigs.files import check_regular
 from bigs.guidance.crops import Crop, choose_frames, cut_crop
 from bigs.guidance.diffusers import edge_detector
 from bigs.guidance.diffusers_folder import Device, Parts, Precision, load_parts
@@ -158,6 +159,7 @@ def read_state(path: Path, form: str, origin: str, of_what: str) -> tuple[dict[s
     Raises:
         InputError: damaged, or not of this `form` and `origin`; `of_what` says what those depend on.
     """
+    check_regular(path, "a readable state")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from bigs.checks import InputError
 from bigs.commands.clips import open_clip
 from bigs.commands.run_folder import CONFIG
 from bigs.data.base import Clip
+from bigs.files import read_yaml
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import Side
 
@@ -50,7 +49,7 @@ def hand_models_of_run(run: Path) -> Mapping[Side, HandModel]:
 def origin_of(run: Path) -> Mapping[str, Any]:
     """What the run's config.yaml says; nothing when it cannot be read."""
     try:
-        found = yaml.safe_load((run / CONFIG).read_text())
-    except (OSError, yaml.YAMLError):
+        found = read_yaml(run / CONFIG)
+    except InputError:
         return {}
     return found if isinstance(found, dict) else {}

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from bigs.atomic import atomic_write, named_errors
+from bigs.files import read_bytes
 
 Event = dict[str, Any]
 
@@ -65,7 +66,7 @@ class RunLog:
 def read_log(path: Path) -> list[Event]:
     """The events of a log; a last line that was cut off when the run was killed is left out."""
     events = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
+    for line in read_bytes(path, "a run's log").splitlines() if path.exists() else []:
         try:
             events.append(json.loads(line))
         except ValueError:

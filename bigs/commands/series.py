@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from bigs.checks import InputError
 from bigs.commands.reconstruct import reconstruct, run_origin
 from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
 from bigs.commands.run_log import read_log
+from bigs.files import read_json, read_yaml
 from bigs.train.config import RunConfig
 from bigs.train.config_file import load_config
 from bigs.train.profile import profiled
@@ -61,7 +59,7 @@ def check_folders(runs: list[PlannedRun]) -> None:
             raise InputError(
                 f"{path}: expected the configuration of this run, found another (remove the folder)"
             )
-        stored = yaml.safe_load(path.read_text())
+        stored = read_yaml(path)
         for key, value in run_origin(run.clip, run.hand_model).items():
             if stored.get(key) != value:
                 raise InputError(
@@ -130,7 +128,4 @@ def _run(run: PlannedRun, listen: Listener) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
+    return read_json(path, "what a finished run holds")

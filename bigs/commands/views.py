@@ -13,12 +13,12 @@ import torch
 from PIL import Image
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, check_pixels
 from bigs.commands.formats import FPS
 from bigs.commands.rendering import render_depth, render_frame, straight_rgba, turned_camera
 from bigs.commands.run_folder import load_run
 from bigs.data.render_cameras import CameraPath, load_cameras
-from bigs.data.transforms import MOST_CAMERAS, RenderCamera, check_pixels
+from bigs.data.transforms import MOST_CAMERAS, MOST_PIXELS, RenderCamera
 from bigs.models.playback import Playback
 from bigs.types import Entity
 from bigs.viewer.preview import save_picture, to_bytes, write_video
@@ -159,7 +159,7 @@ def _check(shot: Shot, wanted: Wanted) -> None:
     if shot.size is not None:
         if min(shot.size) < 1:
             raise InputError(f"--size: expected two positive numbers, found {shot.size[0]} {shot.size[1]}")
-        check_pixels("--size", *shot.size)
+        check_pixels("--size", *shot.size, MOST_PIXELS)
 
 
 def _from_file(playback: Playback, path: Path, shot: Shot) -> CameraPath:

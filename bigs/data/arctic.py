@@ -17,10 +17,12 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
-from bigs.data.fields import array_field, mapping_field, read_json, require
+from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import LONGEST_M, check_solid, read_mesh
 from bigs.data.optics import Optics
+from bigs.files import read_json
+from bigs.names import check_name
 from bigs.types import SIDES
 from bigs.unpickle import load_npy
 
@@ -145,7 +147,7 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
     K, cam_from_world = _camera(view, where, meta, rows)
     width, height = (int(value) for value in sizes[view.view])
     return Annotation(
-        name=view.name,
+        name=check_name(f"{view.root}: sequence", view.name),
         frame_names=tuple(frame_names),
         width=width,
         height=height,

@@ -12,6 +12,7 @@ import numpy as np
 
 from bigs.data.images import read_image, read_mask
 from bigs.data.optics import Optics
+from bigs.names import check_name
 from bigs.types import Entity, Side
 
 
@@ -49,9 +50,13 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Clip:
-    """A monocular clip with its initial estimates, or with a dataset's annotation in their place."""
+    """A monocular clip with its initial estimates, or with a dataset's annotation in their place.
 
-    name: str
+    Raises:
+        InputError: a name that could not name a file.
+    """
+
+    name: str  # names files; see `bigs.names.check_name`
     folder: Path  # where image/, mask/ and data.npy lie
     frame_names: tuple[str, ...]  # T original names
     image_paths: tuple[Path, ...]
@@ -70,6 +75,9 @@ class Clip:
     annotated: bool = False  # the tracks are a dataset's truth, which no reconstruction may start from
     optics: Optics | None = None  # how the files differ from the pictures, where they do
     notes: tuple[str, ...] = ()  # what of the estimates was odd, or was taken out (see `plausible`)
+
+    def __post_init__(self) -> None:
+        check_name(f"{self.folder}: name", self.name)
 
     def __len__(self) -> int:
         return len(self.image_paths)

@@ -6,15 +6,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_shape, shown
+from bigs.checks import InputError, check_finite, check_shape, shown
 
 # Metres, pixels, radians, counts: no honest number is larger, and squares of larger ones leave float32.
 LARGEST = 1e15
@@ -75,28 +73,3 @@ def require(where: str, values: Mapping[str, Any], key: str) -> Any:
         found = ", ".join(keys[:8]) + (", ..." if len(keys) > 8 else "")
         raise InputError(f"{where}: expected this field, found {f'only {found}' if keys else 'no fields'}")
     return values[key]
-
-
-def read_json(path: Path) -> Any:
-    """What a JSON file holds, or an InputError."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a {path.name}, found no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a readable text file, found {error}") from None
-    except (ValueError, RecursionError) as error:  # a plain ValueError of integers beyond 4300 digits
-        raise InputError(f"{path}: expected JSON, found {error}") from None
-
-
-def read_npz(path: Path, what: str, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file, or some of them, or an InputError that calls what was wanted `what`."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files if keys is None or key in keys}
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected {what}, found no such file") from None
-    except ARCHIVE_ERRORS as error:
-        raise InputError(
-            f"{path}: expected an .npz of plain arrays, found {error or type(error).__name__}"
-        ) from None

@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from bigs.archives import read_npz
 from bigs.checks import InputError, check_faces, check_rotations
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, number_field, read_npz, require
+from bigs.data.fields import array_field, number_field, require
 from bigs.data.meshes import check_solid, read_mesh
+from bigs.files import read_text
+from bigs.names import check_name
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
 OBJECT_FILE = "gt_object.ply"
@@ -184,10 +187,10 @@ def _read_faces(file: Path, arrays: Mapping[str, np.ndarray], key: str, vertex_c
 
 def _frame_names(file: Path, frames: int) -> tuple[str, ...]:
     corres = file.parent / "build" / "corres.txt"
-    names = corres.read_text().split() if corres.is_file() else []
+    names = read_text(corres, "a list of frame names").split() if corres.exists() else []
     if names and len(names) != frames:
         raise InputError(f"{file}: expected the {len(names)} frames that {corres} lists, found {frames}")
-    return tuple(names) or tuple(f"{t:04d}" for t in range(frames))
+    return tuple(check_name(str(corres), name) for name in names) or tuple(f"{t:04d}" for t in range(frames))
 
 
 def _field(

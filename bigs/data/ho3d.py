@@ -21,6 +21,8 @@ from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import check_solid, read_mesh
 from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.files import open_regular
+from bigs.names import check_name
 from bigs.types import Side
 from bigs.unpickle import restricted_load
 
@@ -123,7 +125,7 @@ def read_ho3d(
     if any(meta.get("handPose") is not None for meta in metas):
         hands["right"] = _read_hand(files, metas, hands_mean)
     return Annotation(
-        name=clip.name,
+        name=check_name(f"{clip.folder}: name", clip.name),
         frame_names=tuple(frame_names),
         width=size[0],
         height=size[1],
@@ -135,9 +137,7 @@ def read_ho3d(
 
 
 def _read_meta(file: Path) -> Mapping[str, Any]:
-    if not file.is_file():
-        raise InputError(f"{file}: expected the annotation of a frame, found no such file")
-    with file.open("rb") as stream:
+    with open_regular(file, "the annotation of a frame") as stream:
         return mapping_field(str(file), restricted_load(stream, name=str(file)))
 
 
@@ -174,8 +174,12 @@ def _read_hand(
 def _read_object(
     clip: Ho3dClip, files: Sequence[Path], metas: Sequence[Mapping[str, Any]], valid: np.ndarray
 ) -> ObjectTruth | None:
-    """The YCB model in every frame; None where the models were not downloaded."""
-    name = str(metas[int(np.flatnonzero(valid)[0])].get("objName"))
+    """The YCB model in every frame; None where it is not named or the models were not downloaded."""
+    first = int(np.flatnonzero(valid)[0])
+    name = metas[first].get("objName")
+    if name is None:
+        return None
+    name = check_name(f"{files[first]}: objName", name)
     places = [clip.root / folder / name / "textured_simple.obj" for folder in _MODEL_FOLDERS]
     model = next((place for place in places if place.is_file()), None)
     if model is None:

@@ -29,6 +29,8 @@ from bigs.data.images import (
 )
 from bigs.data.projection import CAMERA_TOLERANCE, decompose_projection
 from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.files import read_text
+from bigs.names import check_name
 from bigs.types import ENTITIES, SIDES, Side
 from bigs.unpickle import load_npy
 
@@ -62,6 +64,8 @@ def load_hold(path: str | Path) -> Clip:
     check_pairs(image_paths, mask_paths)
 
     data = mapping_field(str(file), load_npy(file))
+    name = data.get("seq_name")
+    name = check_name(f"{file}: seq_name", _sequence_name(folder) if name in (None, "") else name)
     frames = len(image_paths)
     height, width = read_image(image_paths[0]).shape[:2]
     K, cam_from_world, scene_scale = _read_cameras(file, data, frames, width)
@@ -78,7 +82,7 @@ def load_hold(path: str | Path) -> Clip:
     normalize_shift = array_field(where, require(where, data, "normalize_shift"), (3,))
 
     return Clip(
-        name=str(data.get("seq_name") or _sequence_name(folder)),
+        name=name,
         folder=folder,
         frame_names=frame_names,
         image_paths=image_paths,
@@ -173,13 +177,14 @@ def _sequence_name(folder: Path) -> str:
 
 
 def _frame_names(file: Path, image_paths: Sequence[Path]) -> tuple[str, ...]:
-    if not file.is_file():
+    if not file.exists():
         return tuple(path.name for path in image_paths)
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: expected a text file of frame names, found {error}") from None
-    names = tuple(line.strip() for line in lines if line.strip())
+    lines = read_text(file, "a list of frame names").splitlines()
+    names = tuple(
+        check_name(f"{file}: line {number}", line.strip())
+        for number, line in enumerate(lines, 1)
+        if line.strip()
+    )
     if len(names) != len(image_paths):
         raise InputError(
             f"{file}: expected one line for each of {len(image_paths)} images, found {len(names)}"

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.checks import InputError
+from bigs.names import check_name
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -23,7 +24,7 @@ def list_frames(folder: Path, suffixes: Sequence[str]) -> tuple[Path, ...]:
     """The image files of `folder` in name order, which is frame order.
 
     Raises:
-        InputError: the folder is missing or holds no such file.
+        InputError: the folder is missing or holds no such file, or one whose name other systems refuse.
     """
     if not folder.is_dir():
         raise InputError(
@@ -32,6 +33,8 @@ def list_frames(folder: Path, suffixes: Sequence[str]) -> tuple[Path, ...]:
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     if not paths:
         raise InputError(f"{folder}: expected frames ({', '.join(suffixes)}), found none")
+    for path in paths:
+        check_name(f"{folder}: frames", path.name)
     return tuple(paths)
 
 

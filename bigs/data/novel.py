@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bigs.archives import read_npz
 from bigs.checks import InputError
-from bigs.data.fields import array_field, read_npz, require
+from bigs.data.fields import array_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image, read_mask
 
 CAMERAS = "cameras.npz"

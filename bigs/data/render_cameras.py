@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.data.fields import mapping_field, number_field, read_json, require
+from bigs.data.fields import mapping_field, number_field, require
 from bigs.data.transforms import (
     PlacedCamera,
     RenderCamera,
@@ -24,6 +24,7 @@ from bigs.data.transforms import (
     size_field,
     viewmat_field,
 )
+from bigs.files import read_json
 
 
 class CameraPath(NamedTuple):

@@ -23,10 +23,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bigs.archives import read_npz
 from bigs.checks import InputError
 from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.fields import array_field, mapping_field, read_json, read_npz, require
+from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.images import (
     IMAGE_SUFFIXES,
@@ -38,6 +39,8 @@ from bigs.data.images import (
 )
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.data.transforms import read_cameras
+from bigs.files import read_json
+from bigs.names import check_inside, check_name
 from bigs.types import SIDES, Side
 
 HANDS_FILE = "hands.npz"
@@ -83,7 +86,7 @@ def load_sfm_folder(path: str | Path) -> Clip:
     track = _object_track(folder, model, [file.stem for file in image_paths], hands, scale)
     shift = shift_before(np.median(track.points_world().mean(axis=1), axis=0))
     return Clip(
-        name=folder.resolve().name,
+        name=check_name(f"{folder}: name", folder.resolve().name),
         folder=folder,
         frame_names=tuple(file.name for file in image_paths),
         image_paths=image_paths,
@@ -128,8 +131,8 @@ def _read_transforms(folder: Path, size: tuple[int, int]) -> SfmModel | None:
         name = require(f"{camera.where}.file_path", camera.entry, "file_path")
         poses[Path(str(name)).stem] = camera.viewmat
     document = mapping_field(str(file), read_json(file))
-    name = str(require(f"{file}: ply_file_path", document, "ply_file_path"))
-    points, colors = _read_points(folder / name)
+    where = f"{file}: ply_file_path"
+    points, colors = _read_points(folder / check_inside(where, require(where, document, "ply_file_path")))
     return SfmModel(cameras[0].K, poses, points, colors)
 
 

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bigs.checks import InputError, shown
-from bigs.data.fields import array_field, mapping_field, number_field, read_json, require
+from bigs.checks import InputError, check_pixels, shown
+from bigs.data.fields import array_field, mapping_field, number_field, require
+from bigs.files import read_json
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -24,7 +25,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RIGID_TOLERANCE = 1e-4
 
 # So many pictures, each of so many pixels, are rendered at most: an hour and half a gigabyte.
-MOST_CAMERAS, MOST_PIXELS = 10_000, 4096 * 4096
+MOST_CAMERAS, MOST_PIXELS = 10_000, 7680 * 4320
 
 
 class RenderCamera(NamedTuple):
@@ -147,7 +148,7 @@ def size_field(
     if size is not None and width_key not in values and height_key not in values:
         return size
     width, height = (count_field(f"{prefix}{key}", values, key, 1) for key in (width_key, height_key))
-    check_pixels(f"{prefix}{width_key}", width, height)
+    check_pixels(f"{prefix}{width_key}", width, height, MOST_PIXELS)
     return width, height
 
 
@@ -155,12 +156,6 @@ def check_cameras(where: str, count: int) -> None:
     """Raise `InputError` if there are more cameras than are rendered in one go."""
     if count > MOST_CAMERAS:
         raise InputError(f"{where}: expected at most {MOST_CAMERAS} cameras, found {count}")
-
-
-def check_pixels(where: str, width: int, height: int) -> None:
-    """Raise `InputError` if a picture is larger than one that is rendered."""
-    if width * height > MOST_PIXELS:
-        raise InputError(f"{where}: expected at most {MOST_PIXELS} pixels, found {width} x {height}")
 
 
 def viewmat_field(where: str, stored: Any) -> np.ndarray:

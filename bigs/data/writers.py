@@ -17,8 +17,9 @@ from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.arctic import DEFAULT_VIEW, MM_PER_M, ArcticView
 from bigs.data.base import Clip
-from bigs.data.fields import read_json
 from bigs.data.ho3d import CV_FROM_GL, SPLITS
+from bigs.files import read_json
+from bigs.names import check_name
 
 
 def write_arctic(
@@ -46,6 +47,8 @@ def write_arctic(
     Returns:
         The folder of images, which names the view.
     """
+    check_name("subject", subject)
+    check_name("sequence", sequence)
     target = ArcticView(Path(root), subject, sequence, view)
     folder = target.frames_in("images")
     for part in (target.raw("mano").parent, target.root / "meta", folder):
@@ -107,6 +110,8 @@ def write_ho3d(
     """
     if not np.allclose(annotation.cam_from_world, CV_FROM_GL):
         raise InputError(f"{annotation.name}: expected the world to be the OpenGL camera, found another")
+    for field, name in (("split", split), ("clip", clip), ("object_name", object_name)):
+        check_name(field, name)
     folder = Path(root) / split / clip
     truth, hand = annotation.object, annotation.hands["right"]
     if truth is None:

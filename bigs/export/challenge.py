@@ -19,7 +19,8 @@ import numpy as np
 import torch
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, check_finite, check_shape
+from bigs.checks import InputError, check_finite, check_shape, shown
+from bigs.names import check_name, check_path
 from bigs.types import ENTITIES, SIDES, HandObjectTrajectory, Side
 
 # HOLD's axes: x right, y up, z backward.
@@ -268,9 +269,10 @@ def _check(where: str, content: Mapping[str, Any]) -> None:
     """What is there fits: names, shapes, finite values, faces in range, points relative to their roots."""
     for key, kind in (("fnames", list), ("full_seq_name", str)):
         if not isinstance(content.get(key), kind):
-            raise InputError(f"{where}: {key}: expected a {kind.__name__}, found {content.get(key)!r:.80}")
-    if not all(isinstance(name, str) for name in content["fnames"]):
-        raise InputError(f"{where}: fnames: expected image names, found {content['fnames']!r:.80}")
+            raise InputError(f"{where}: {key}: expected a {kind.__name__}, found {shown(content.get(key))}")
+    check_name(f"{where}: full_seq_name", content["full_seq_name"])
+    for name in content["fnames"]:
+        check_path(f"{where}: fnames", name)
     present = _entities(content)
     if not present:
         raise InputError(f"{where}: expected at least one of root.right, root.left, root.object, found none")
@@ -289,7 +291,7 @@ def _check(where: str, content: Mapping[str, Any]) -> None:
         check_finite(f"{where}: {key}", content[key])
     for node, faces in content["faces"].items():
         if not isinstance(faces, torch.Tensor) or faces.is_floating_point():
-            raise InputError(f"{where}: faces.{node}: expected an integer tensor, found {faces!r:.80}")
+            raise InputError(f"{where}: faces.{node}: expected an integer tensor, found {shown(faces)}")
         check_shape(f"{where}: faces.{node}", faces, ("F", 3))
         if node not in n_verts or not faces.numel():
             continue

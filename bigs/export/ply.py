@@ -15,6 +15,7 @@ import torch
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_finite, check_shape
+from bigs.files import open_regular
 from bigs.types import Gaussians
 
 # rgb = 0.5 + SH_C0 * f_dc, the constant real spherical harmonic
@@ -105,14 +106,13 @@ def load_splats(path: str | Path) -> Gaussians:
             long, or holds a value that is not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: expected a splat PLY file, found no such file")
-    with path.open("rb") as file:
+    with open_regular(path, "a splat PLY file") as file:
         count, dtype = _read_header(path, file)
-        body = file.read()
-    if len(body) != count * dtype.itemsize:
+        expected = count * dtype.itemsize
+        body = file.read(expected + 1)
+    if len(body) != expected:
         raise InputError(
-            f"{path}: expected {count * dtype.itemsize} bytes after the header "
+            f"{path}: expected {expected} bytes after the header "
             f"({count} vertices of {dtype.itemsize} bytes), found {len(body)}"
         )
     table = np.frombuffer(body, dtype)

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bigs.archives import read_npz
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError, check_finite, check_rotations, check_shape
+from bigs.checks import InputError, check_finite, check_rotations, check_shape
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-poses-1"
@@ -75,13 +76,7 @@ def load_poses(path: str | Path) -> ClipPoses:
     Raises:
         InputError: the file is missing, damaged, of another format, or has a field that does not fit.
     """
-    if not Path(path).is_file():
-        raise InputError(f"{path}: expected a poses file, found no such file")
-    try:
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-    except ARCHIVE_ERRORS as error:
-        raise InputError(f"{path}: expected an npz file, found a damaged one ({error})") from error
+    arrays = read_npz(path, "a poses file")
     found = str(arrays.get("format", "none"))
     if found != FORMAT:
         raise InputError(f"{path}: expected format {FORMAT}, found {found}")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError
+from bigs.checks import ARCHIVE_ERRORS, InputError, shown
 from bigs.export.challenge import validate_challenge
 from bigs.types import ENTITIES
 
@@ -101,7 +101,7 @@ def _check_archive(where: str, buffer: io.BytesIO, sequences: Sequence[str]) -> 
         for info in members:
             folder, _, name = info.filename.rpartition("/")
             if folder != FOLDER or not name.endswith(".pt"):
-                raise InputError(f"{where}: expected only {FOLDER}/SEQUENCE.pt, found {info.filename}")
+                raise InputError(f"{where}: expected only {FOLDER}/SEQUENCE.pt, found {shown(info.filename)}")
             if info.file_size > _MAX_BYTES:
                 raise InputError(
                     f"{where}: {info.filename}: expected at most 2 GiB, found {info.file_size} bytes"
@@ -133,7 +133,9 @@ def _check_names(where: str, names: Sequence[str], sequences: Sequence[str]) -> 
         )
     extra = [name for name in names if name not in sequences or names.count(name) > 1]
     if extra:
-        raise InputError(f"{where}: expected only the challenge's sequences, each once, found {extra[0]}")
+        raise InputError(
+            f"{where}: expected only the challenge's sequences, each once, found {shown(extra[0])}"
+        )
 
 
 def _check_prediction(where: str, name: str, content: bytes) -> SubmittedClip:

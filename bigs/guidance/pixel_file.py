@@ -11,6 +11,7 @@ from safetensors.torch import save
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
+from bigs.files import check_regular
 from bigs.guidance.pixel import PixelConfig, PixelDenoiser, PixelNet
 
 FORMAT = "bigs-pixel-prior-2"
@@ -30,8 +31,7 @@ def load_pixel_denoiser(path: Path) -> PixelDenoiser:
     Raises:
         InputError: missing, damaged, or another program's file.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a file of bigs prior train, found no such file")
+    check_regular(path, "a file of bigs prior train")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = json.loads((file.metadata() or {}).get("bigs", "{}"))

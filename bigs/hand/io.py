@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from bigs.checks import ARCHIVE_ERRORS, InputError, check_choice, check_finite, check_shape
+from bigs.archives import read_npz
+from bigs.checks import InputError, check_choice, check_finite, check_shape
+from bigs.files import open_regular
 from bigs.hand.model import MANO_PARENTS, HandModel
 from bigs.hand.procedural import procedural_hand
 from bigs.types import SIDES, Side
@@ -96,10 +98,10 @@ def read_model_file(file: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is a pickle of anything but data.
     """
     if file.suffix == ".npz":
-        return _read_npz(file)
+        return read_npz(file, "a hand model")
     if file.suffix != ".pkl":
         raise InputError(f"{file}: expected a hand model with suffix .npz or .pkl, found '{file.suffix}'")
-    with file.open("rb") as stream:
+    with open_regular(file, "a hand model") as stream:
         fields = restricted_load(stream, name=str(file), allow=CHUMPY)
     if not isinstance(fields, dict):
         raise InputError(f"{file}: expected a pickled dict of fields, found {type(fields).__name__}")
@@ -150,18 +152,6 @@ def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> 
         hands_mean=hands_mean.reshape(-1, 3),
         tip_vertex_ids=_tips(fields, vertices, name),
     )
-
-
-def _read_npz(file: Path) -> dict[str, Any]:
-    try:
-        with file.open("rb") as stream:
-            archive = np.load(stream, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("a single array")
-            return {key: archive[key] for key in archive.files}
-    except ARCHIVE_ERRORS as error:
-        reason = str(error) or "nothing"
-        raise InputError(f"{file}: expected an .npz archive of plain arrays, found: {reason}") from error
 
 
 def _listed(fields: dict[str, Any]) -> str:

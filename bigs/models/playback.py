@@ -17,6 +17,7 @@ from bigs.models.lighting import Lighting, light
 from bigs.models.object_splats import CanonicalObject, pose_object
 from bigs.models.poses import ObjectFrames
 from bigs.models.scene import Scene, concatenate
+from bigs.names import check_name
 from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 
 # What has a value for each frame.
@@ -66,9 +67,13 @@ class ObjectPlayback:
 
 @dataclass(frozen=True)
 class Playback:
-    """Everything a renderer or an exporter needs."""
+    """Everything a renderer or an exporter needs.
 
-    name: str
+    Raises:
+        InputError: a name that could not name a file.
+    """
+
+    name: str  # names files; see `bigs.names.check_name`
     frame_names: tuple[str, ...]
     K: Tensor  # [3, 3]
     width: int
@@ -77,6 +82,9 @@ class Playback:
     light: Tensor | None  # [8, 3] the clip's light (see `lighting.light`); None: colours are fixed
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
+
+    def __post_init__(self) -> None:
+        check_name("the scene's name", self.name)
 
     @property
     def entities(self) -> tuple[Entity, ...]:

@@ -15,11 +15,21 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, check_faces, check_finite, check_rotations, check_shape, shown
+from bigs.checks import (
+    InputError,
+    check_faces,
+    check_finite,
+    check_pixels,
+    check_rotations,
+    check_shape,
+    shown,
+)
 from bigs.checksum import checksum
+from bigs.files import check_regular, parse_json
 from bigs.models.hand_splats import CanonicalHand
 from bigs.models.object_splats import CanonicalObject
 from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
+from bigs.names import check_name
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-scene-4"
@@ -65,18 +75,14 @@ def load_playback(path: Path) -> Playback:
     Raises:
         InputError: missing, damaged, of another format, or with a part that does not fit.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected a finished run's scene, found no such file")
+    check_regular(path, "a finished run's scene")
     try:
         with safe_open(path, framework="pt") as file:
             text = (file.metadata() or {}).get("bigs", "{}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except Exception as error:  # the reader raises its own, and torch's of types that it does not know
         raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
-    try:
-        facts = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: metadata: expected JSON, found {shown(text)} ({error})") from None
+    facts = parse_json(f"{path}: metadata", text)
     if not isinstance(facts, dict):
         raise InputError(f"{path}: metadata: expected a dictionary, found {shown(facts)}")
     if facts.get("format") not in (FORMAT, _UNSUMMED):
@@ -135,12 +141,12 @@ def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) 
 def _check_facts(where: str, facts: Mapping[str, Any]) -> None:
     name, names = facts.get("name"), facts.get("frame_names")
     size, shift = facts.get("size"), facts.get("normalize_shift")
-    if not isinstance(name, str):
-        raise InputError(f"{where}: name: expected text, found {shown(name)}")
+    check_name(f"{where}: name", name)
     if not isinstance(names, list) or not names or not all(isinstance(frame, str) for frame in names):
         raise InputError(f"{where}: frame_names: expected a list of texts, found {shown(names)}")
     if not isinstance(size, list) or len(size) != 2 or not all(_is_pixels(side) for side in size):
         raise InputError(f"{where}: size: expected a width and a height in pixels, found {shown(size)}")
+    check_pixels(f"{where}: size", *size)
     if not isinstance(shift, list) or len(shift) != 3 or not all(_is_finite(part) for part in shift):
         raise InputError(f"{where}: normalize_shift: expected three numbers, found {shown(shift)}")
 

@@ -22,10 +22,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from bigs.archives import read_npz
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, mapping_field, read_npz, require
+from bigs.data.fields import array_field, mapping_field, require
+from bigs.files import read_json
+from bigs.names import check_name
 from bigs.types import SIDES, Side
 
 VERSION = 1
@@ -132,7 +135,9 @@ def read_frame_set(processed: Path) -> FrameSet:
     stored = _read_json(file)
     names = require(f"{file}: names", stored, "names")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise InputError(f"{file}: names: expected a list of frame names, found {str(names)[:40]}")
+        raise InputError(f"{file}: names: expected a list of frame names, found {shown(names)}")
+    for name in names:
+        check_name(f"{file}: names", name)
     size = {key: _number(file, stored, key) for key in ("width", "height", "fps")}
     K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
@@ -361,12 +366,7 @@ def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:
 
 
 def _read_json(file: Path) -> Mapping[str, Any]:
-    try:
-        return mapping_field(str(file), json.loads(file.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{file}: expected what an earlier step writes, found no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: expected JSON, found {error}") from None
+    return mapping_field(str(file), read_json(file, "what an earlier step writes"))
 
 
 def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:

@@ -10,7 +10,6 @@ these.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple, cast
@@ -19,6 +18,7 @@ import numpy as np
 
 from bigs.checks import InputError, check_choice
 from bigs.data.fields import array_field, mapping_field, require
+from bigs.files import read_json
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.keypoints import Keypoints, frame_pixels
 from bigs.types import ENTITIES, MASK_VALUES, Entity, Side
@@ -44,12 +44,7 @@ def read_clicks(file: Path, frames: FrameSet) -> dict[Entity, list[Click]]:
     Raises:
         InputError: unreadable, not in the documented layout, a frame that is not there, or a point outside.
     """
-    try:
-        stored = mapping_field(str(file), json.loads(file.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{file}: expected a file of clicks, found no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: expected JSON, found {error}") from None
+    stored = mapping_field(str(file), read_json(file, "a file of clicks"))
     scale, _ = frame_pixels(file, stored, frames)
     found: dict[Entity, list[Click]] = {}
     rows = mapping_field(f"{file}: frames", require(f"{file}: frames", stored, "frames"))

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bigs.archives import read_npz
 from bigs.checks import InputError
-from bigs.data.fields import array_field, mapping_field, read_npz, require
+from bigs.data.fields import array_field, mapping_field, require
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.matching import match_count, match_names
 from bigs.types import SIDES, Side

@@ -22,6 +22,7 @@ import numpy as np
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_choice
 from bigs.data.fields import array_field, mapping_field, require
+from bigs.files import read_json
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.matching import match_count, match_names
 from bigs.types import SIDES, Side
@@ -92,12 +93,7 @@ def write_keypoints(file: Path, keypoints: Mapping[Side, Keypoints], frames: Fra
 
 
 def _read(file: Path) -> Mapping[str, Any]:
-    try:
-        return mapping_field(str(file), json.loads(file.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{file}: expected a keypoint file, found no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: expected JSON, found {error}") from None
+    return mapping_field(str(file), read_json(file, "a keypoint file"))
 
 
 def frame_pixels(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> tuple[np.ndarray, float]:

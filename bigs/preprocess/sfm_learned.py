@@ -12,6 +12,7 @@ from kornia.feature import DISK, LightGlue
 from PIL import Image
 
 from bigs.checks import InputError
+from bigs.files import check_regular
 from bigs.motion.features import NOTHING, FeatureConfig, FrameFeatures, crop_box, enlargement
 
 # DISK's network halves its input four times.
@@ -111,10 +112,7 @@ def _as_input(features: FrameFeatures, size: tuple[int, int]) -> dict[str, torch
 
 
 def _read_weights(file: Path) -> Mapping[str, Any]:
-    if not file.is_file():
-        raise InputError(
-            f"{file}: expected a file of weights, found {'a folder' if file.exists() else 'nothing'}"
-        )
+    check_regular(file, "a file of weights")
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds

@@ -13,6 +13,7 @@ from torch import Tensor
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
 from bigs.checksum import checksum
+from bigs.files import check_regular
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.object_splats import Anchors, ObjectSplats
@@ -81,6 +82,7 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     path = folder / FILE_NAME
     if not path.exists():
         return None
+    check_regular(path, "a checkpoint")
     damaged = f"{path}: expected a checkpoint, found a damaged file (remove it to start anew)"
     try:
         with safe_open(path, framework="pt") as file:

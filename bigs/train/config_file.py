@@ -13,6 +13,7 @@ import yaml
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, shown
+from bigs.files import parse_yaml, read_yaml
 from bigs.train.config import RunConfig
 from bigs.train.ranges import check_ranges
 
@@ -75,14 +76,7 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
 
 def _scalar(change: str, text: str) -> Any:
     """A value as YAML reads it, except that 1e-3 is a number, too."""
-    try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        # ValueError comes of integers of thousands of digits and of days that no month has.
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"--set {change[:_SHOWN]}: expected a value, found {shown(text)} ({reason})"
-        ) from error
+    value = parse_yaml(f"--set {change[:_SHOWN]}", text)
     if isinstance(value, str):
         try:
             return float(value)
@@ -104,12 +98,7 @@ def load_config(path: Path) -> RunConfig:
     Raises:
         InputError: missing, not YAML, or not a configuration.
     """
-    try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: expected a configuration file, found none ({error.strerror})") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from error
+    data = read_yaml(path, "a configuration file")
     if not isinstance(data, dict) or "config" not in data:
         raise InputError(f"{path}: expected a key 'config', found {type(data).__name__} without it")
     return from_plain(data["config"], str(path))

@@ -78,9 +78,9 @@ def test_names_do_not_repeat(tmp_path: Path) -> None:
     [
         ("m.xml", "a", "expected one of .yaml, .yml, .json, .csv, .txt, found '.xml'"),
         ("m.txt", "# nothing\n", "expected at least one clip, found none"),
-        ("m.yaml", "clips: [a\n", "expected YAML, found: "),
-        ("m.json", "{", "expected JSON, found: "),
-        ("m.yaml", "clip: a\n", "expected clips and defaults, found clip"),
+        ("m.yaml", "clips: [a\n", "expected YAML, found "),
+        ("m.json", "{", "expected JSON, found "),
+        ("m.yaml", "clip: a\n", "expected clips and defaults, found 'clip'"),
         ("m.yaml", "clips: a\n", "expected a list of clips, found str"),
         ("m.yaml", "clips: [a]\ndefaults: [fast]\n", "defaults: expected fields and values"),
         ("m.yaml", "- {clip: a, prest: fast}\n", "entry 1: field: expected one of clip, name, preset"),

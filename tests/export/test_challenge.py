@@ -203,7 +203,7 @@ def rewrite(path, change):
     ("change", "message"),
     [
         (lambda c: c.pop("fnames"), "fnames: expected a list, found None"),
-        (lambda c: c.update(fnames=[1, 2, 3]), "fnames: expected image names"),
+        (lambda c: c.update(fnames=[1, 2, 3]), "fnames: expected a path"),
         (lambda c: c.update({"j3d_c.left": [1]}), r"j3d_c\.left: expected a tensor, found list"),
         (lambda c: c["v3d_c.right"].fill_(torch.inf), r"v3d_c\.right: expected finite values"),
         (lambda c: c.update(faces=torch.zeros(3)), "faces: expected a dictionary, found Tensor"),

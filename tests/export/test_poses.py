@@ -71,7 +71,7 @@ def test_wrong_files_are_named(tmp_path, poses):
     with pytest.raises(InputError, match="found no such file"):
         load_poses(path)
     path.write_bytes(b"not a zip")
-    with pytest.raises(InputError, match=r"poses\.npz: expected an npz file"):
+    with pytest.raises(InputError, match=r"poses\.npz: expected a poses file"):
         load_poses(path)
     np.savez(path, K=np.eye(3))
     with pytest.raises(InputError, match="expected format bigs-poses-1, found none"):

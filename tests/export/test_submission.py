@@ -92,7 +92,7 @@ def test_the_challenge_has_nine_sequences(archive: Path) -> None:
     assert len(set(TEST_SEQUENCES)) == 9 and TEST_SEQUENCES[0] == "arctic_s03_box_grab_01_1"
     with pytest.raises(InputError, match=r"expected the 9 sequences .* found no arctic_s03_box_grab_01_1"):
         check_submission(archive)
-    with pytest.raises(InputError, match=f"each once, found {NAMES[1]}"):
+    with pytest.raises(InputError, match=f"each once, found '{NAMES[1]}'"):
         check_submission(archive, NAMES[:1])
 
 

@@ -1,0 +1,99 @@
+"""Names that come from a file and become names of files: one plain component each, on any system."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from pathlib import Path
+from typing import Any
+
+from bigs.checks import InputError, shown
+
+# File systems allow 255 bytes; what writers add to a name (".safetensors", a temporary file's suffix) has to
+# fit, too.
+MAX_NAME_BYTES = 200
+# Of a whole path, which systems limit to 4096 bytes.
+_MAX_PATH_BYTES = 4000
+_MAX_PART_BYTES = 255
+# Windows has devices of these names in every folder, whatever suffix follows.
+_DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9¹²³])", re.IGNORECASE)
+
+
+def check_name(where: str, name: Any) -> str:
+    """`name` if it can name a file in any folder and lead nowhere else.
+
+    Args:
+        where: file and field, for the message.
+        name: what the file says.
+
+    Raises:
+        InputError: no text, empty, a separator, `.` or `..`, control characters, not Unicode, a device of
+            Windows, a dot or a blank at the end, or too long.
+    """
+    reason = _text_reason(name) or _component_reason(name)
+    if reason:
+        raise InputError(f"{where}: expected a plain name, found {shown(name)} ({reason})")
+    return str(name)
+
+
+def check_path(where: str, path: Any) -> str:
+    """`path` if it can be looked up: text without control characters, whose parts are not too long.
+
+    Unlike a name it may lead anywhere; use it for what is only read, and where the user says what.
+
+    Raises:
+        InputError: it cannot.
+    """
+    reason = _text_reason(path)
+    if not reason:
+        parts = [len(part.encode()) for part in str(path).split("/")]
+        if max(parts) > _MAX_PART_BYTES or sum(parts) + len(parts) > _MAX_PATH_BYTES:
+            reason = "too long"
+    if reason:
+        raise InputError(f"{where}: expected a path, found {shown(path)} ({reason})")
+    return str(path)
+
+
+def check_inside(where: str, path: Any) -> Path:
+    """`path` if it leads from a folder to what lies in it: plain names with `/` between them.
+
+    Raises:
+        InputError: it leads elsewhere, or a part is no plain name.
+    """
+    parts = check_path(where, path).removeprefix("./").split("/")
+    for part in parts:
+        reason = _component_reason(part)
+        if reason:
+            raise InputError(
+                f"{where}: expected a file in the same folder or below it, found {shown(path)} ({reason})"
+            )
+    return Path(*parts)
+
+
+def _text_reason(text: Any) -> str:
+    """Why a value is no text that a file system takes; empty if it is."""
+    if not isinstance(text, str):
+        return f"{type(text).__name__}, not text"
+    if not text:
+        return "empty"
+    # A short look at a long text: what is wrong with its length is told in any case.
+    if any(unicodedata.category(letter) in ("Cc", "Zl", "Zp") for letter in text[: 4 * _MAX_PATH_BYTES]):
+        return "a control character"
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return "not Unicode text"
+    return "too long" if len(text) > _MAX_PATH_BYTES else ""
+
+
+def _component_reason(name: str) -> str:
+    if "/" in name or "\\" in name or ":" in name:
+        return "a path"
+    if name in ("", ".", ".."):
+        return "another folder"
+    if name[-1] in ". ":
+        return "a dot or a blank at the end"
+    if _DEVICES.fullmatch(name.split(".")[0].rstrip(" ")):
+        return "a device's name on Windows"
+    size = len(name.encode())
+    return f"{size} bytes, more than {MAX_NAME_BYTES}" if size > MAX_NAME_BYTES else ""
