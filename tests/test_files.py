@@ -20,7 +20,7 @@ from bigs import archives
 from bigs.archives import MAX_MEMBERS, read_npz
 from bigs.checks import InputError, shown
 from bigs.commands.manifest import read_manifest
-from bigs.data.transforms import load_transforms
+from bigs.data.transforms import read_cameras
 from bigs.export.ply import load_splats
 from bigs.export.poses import load_poses
 from bigs.files import MAX_DEPTH, MAX_YAML_BYTES, MAX_YAML_NODES, open_regular, read_json, read_yaml
@@ -48,7 +48,7 @@ def little(most: int = 32 << 20, seconds: float = 5.0) -> Iterator[None]:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "x.json": read_json,
-    "transforms.json": load_transforms,
+    "transforms.json": read_cameras,
     "config.yaml": load_config,
     "clips.yaml": read_manifest,
     "clips.csv": read_manifest,
