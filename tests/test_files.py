@@ -161,7 +161,7 @@ HOSTILE_JSON = {
     "deep and closed": ("[" * 200 + "]" * 200, "levels"),
     "deep mappings": ('{"a":' * 300 + "1" + "}" * 300, "levels"),
     "5000 digits": ("9" * 5000, "expected JSON, found"),
-    "400 digits": ("[" + "9" * 400 + "]", "digits, found an integer of 1329 bits"),
+    "400 digits": ("[" + "9" * 400 + "]", "digits, found an integer of"),
     "half a file": ("[1, 2", "expected JSON, found"),
     "nothing": ("", "expected JSON, found"),
 }

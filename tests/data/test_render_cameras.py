@@ -119,7 +119,7 @@ MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
         (frame(frame_index=None), "frame_index: expected this field, or .*--frame N or --play"),
         (
             document(w=16384, h=16384),
-            r"frames\[0\]\.w: expected at most 16777216 pixels, found 16384 x 16384",
+            r"frames\[0\]\.w: expected at most 33177600 pixels, found 16384 x 16384",
         ),
         (document(frames=[3] * (MOST_CAMERAS + 1)), "frames: expected at most 10000 cameras, found 10001"),
         (frame(frame_index=-1), "frame_index.*-1"),
@@ -218,7 +218,7 @@ def test_a_camera_path_of_nerfstudios_viewer(tmp_path: Path) -> None:
         (camera_path(fov=180), r"\[0\]\.fov: expected degrees between 0 and 180, found 180"),
         (camera_path(fov="wide"), r"\[0\]\.fov: expected .*number.*found str"),
         (camera_path(fps=0), "fps: expected a positive number, found 0"),
-        (camera_path(render_width=99999999), "expected at most 16777216 pixels, found 99999999 x 40"),
+        (camera_path(render_width=99999999), "expected at most 33177600 pixels, found 99999999 x 40"),
         (camera_path(render_width=None), "render_width: expected this field"),
     ],
 )

@@ -114,7 +114,7 @@ def test_files_that_are_no_configuration(tmp_path: Path, content: bytes, message
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a configuration file, found none"):
+    with pytest.raises(InputError, match="expected a configuration file, found no such file"):
         load_config(tmp_path / "config.yaml")
     with pytest.raises(InputError, match="expected a configuration file"):
         load_config(tmp_path)
