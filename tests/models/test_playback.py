@@ -181,7 +181,7 @@ def test_a_file_of_something_else_is_an_input_error(tmp_path: Path) -> None:
 
 def test_a_missing_file_is_an_input_error(tmp_path: Path) -> None:
     for path in (tmp_path / "none.safetensors", tmp_path):
-        with pytest.raises(InputError, match="a folder"):
+        with pytest.raises(InputError, match=r"no such file|a folder"):
             load_playback(path)
 
 
