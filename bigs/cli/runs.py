@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
@@ -232,38 +232,49 @@ def render(
 
 def export(
     run: RunPath,
-    format: Format,
+    format: tyro.conf.UseAppendAction[tuple[Format, ...]] = (),
     out: Path | None = None,
     frames: tuple[int, ...] = (),
     all_frames: bool = False,
     clip: Path | None = None,
 ) -> None:
-    """Write a finished run in another program's format.
+    """Write a finished run in other programs' formats.
 
     Args:
         run: the run folder.
-        format: Gaussians: ply (each subject unposed, or posed at chosen frames), spz, splat-glb (glTF with
-            KHR_gaussian_splatting). Meshes: glb (animated: hands with skeletons, object), obj (all subjects
-            at chosen frames), mesh (object), hand-meshes (every frame). Poses: poses (npz), mano, arctic,
-            challenge (.pt). All together over time: rerun.
+        format: repeat it for several. Gaussians: ply (each subject unposed, or posed at chosen frames), spz,
+            splat-glb (glTF with KHR_gaussian_splatting). Meshes: glb (animated: hands with skeletons,
+            object), obj (all subjects at chosen frames, coloured), mesh (object), hand-meshes. Poses: poses
+            (npz), mano, arctic, challenge (.pt). All together over time: rerun.
         out: where to write; the run folder if not given.
-        frames: times to write, for ply, spz, splat-glb, obj and hand-meshes.
+        frames: times to write, for ply, spz, splat-glb, obj and hand-meshes. If not given, ply is unposed,
+            hand-meshes has every frame, and the others the clip's middle one.
         all_frames: write every time, for the same formats.
         clip: the clip with the input images, for rerun, if it is not where the run found it.
     """
     from bigs.checks import InputError
-    from bigs.commands.formats import Choice, write_format
+    from bigs.commands.formats import Choice, check_format, write_format
     from bigs.commands.run_clip import clip_of_run
     from bigs.commands.run_folder import load_run
 
+    if not format:
+        raise InputError(f"--format: expected one or more of {', '.join(get_args(Format))}, found none")
     if frames and all_frames:
         raise InputError("--all-frames: expected this or --frames, found both")
-    if clip is not None and format != "rerun":
-        raise InputError(f"--clip: expected the format rerun, which holds images, found {format}")
+    if clip is not None and "rerun" not in format:
+        raise InputError(f"--clip: expected the format rerun, which holds images, found {', '.join(format)}")
     playback = load_run(run)
     wanted = tuple(range(len(playback))) if all_frames else frames or None
-    images = clip_of_run(run, len(playback), clip) if format == "rerun" else None
-    files = write_format(run if out is None else out, playback, format, Choice(wanted, images))
+    images = clip_of_run(run, len(playback), clip) if "rerun" in format else None
+    choice = Choice(wanted, images)
+    # All are checked before the first is written.
+    for name in format:
+        check_format(playback, name, choice)
+    files = [
+        path
+        for name in dict.fromkeys(format)
+        for path in write_format(run if out is None else out, playback, name, choice)
+    ]
     for path in files if len(files) <= 10 else [files[0], "...", files[-1]]:
         say(str(path))
 

@@ -25,7 +25,7 @@ from bigs.export.splat_glb import save_splat_glb
 from bigs.export.spz import save_spz
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import JOINT_NAMES, MANO_PARENTS, mirror_axis_angle, mirror_points, mirror_rotation
-from bigs.models.playback import HandPlayback, Playback
+from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
 from bigs.models.playback_file import save_playback
 from bigs.models.repose import wrist_of
 from bigs.types import Entity, Gaussians, Side
@@ -56,15 +56,23 @@ def write_format(folder: Path, playback: Playback, name: str, choice: Choice = C
         InputError: unknown format, frames that the clip has not or the format does not take, or a package
             that is not installed.
     """
+    check_format(playback, name, choice)
+    return list(_WRITERS[name](folder, playback, choice))
+
+
+def check_format(playback: Playback, name: str, choice: Choice) -> None:
+    """What `write_format` can know before it writes.
+
+    Raises:
+        InputError: unknown format, or frames that the clip has not or the format does not take.
+    """
     check_choice("format", name, FORMATS)
-    choice = choice or Choice()
     if choice.frames is not None:
         if name not in OF_FRAMES:
             raise InputError(f"frames: expected one of the formats {', '.join(OF_FRAMES)}, found {name}")
         for frame in choice.frames:
             if not 0 <= frame < len(playback):
                 raise InputError(f"frames: expected numbers from 0 to {len(playback) - 1}, found {frame}")
-    return list(_WRITERS[name](folder, playback, choice))
 
 
 def _ready(path: Path) -> Path:
@@ -165,9 +173,14 @@ def _write_hand_meshes(folder: Path, playback: Playback, choice: Choice) -> Iter
 
 
 def _write_obj(folder: Path, playback: Playback, choice: Choice) -> Iterable[Path]:
+    colors: dict[str, np.ndarray] = {
+        side: _hand_colors(side, hand).numpy() for side, hand in playback.hands.items()
+    }
+    if playback.object is not None:
+        colors["object"] = _object_colors(playback.object).numpy()
     for frame in _frames(playback, choice):
         path = _ready(folder / "meshes" / f"frame_{frame:04d}.obj")
-        save_meshes(path, _meshes(playback, frame))
+        save_meshes(path, _meshes(playback, frame), colors)
         yield path
 
 
@@ -175,11 +188,10 @@ def _write_rig(folder: Path, playback: Playback, choice: Choice) -> Iterable[Pat
     obj = None
     if playback.object is not None:
         o = playback.object
-        colors = _surface_colors(o.verts, o.splats.means, o.splats.colors)
         obj = RigidMesh(
             verts=o.verts.numpy(),
             faces=o.faces.numpy(),
-            colors=colors.numpy(),
+            colors=_object_colors(o).numpy(),
             rotations=o.rotations.numpy(),
             transl=o.centers.numpy(),
             scale=float(o.scale),
@@ -243,20 +255,17 @@ def _rigged(side: Side, hand: HandPlayback) -> SkinnedHand:
     """A hand on its own side: what is stored of the canonical hand is mirrored for a left one."""
     orient, wrist = wrist_of(hand)
     rotations, rest_joints = torch.cat([orient[:, None], hand.hand_pose], dim=1), hand.rest_joints
-    canonical = hand.v_posed if hand.v_posed.ndim == 2 else hand.v_posed.mean(0)
     if side == "left":
-        rotations, rest_joints, wrist, canonical = (
+        rotations, rest_joints, wrist = (
             mirror_rotation(rotations),
             mirror_points(rest_joints),
             mirror_points(wrist),
-            mirror_points(canonical),
         )
-    colors = _surface_colors(canonical, hand.splats.points, hand.splats.colors)
     joints = len(MANO_PARENTS)
     return SkinnedHand(
         verts=hand.v_posed.numpy(),
         faces=hand.faces.numpy(),
-        colors=colors.numpy(),
+        colors=_hand_colors(side, hand).numpy(),
         lbs_weights=hand.lbs_weights.numpy(),
         rest_joints=rest_joints.numpy(),
         parents=MANO_PARENTS,
@@ -264,6 +273,19 @@ def _rigged(side: Side, hand: HandPlayback) -> SkinnedHand:
         rotations=rotations.numpy(),
         wrist=wrist.numpy(),
     )
+
+
+def _hand_colors(side: Side, hand: HandPlayback) -> Tensor:
+    """The colours of a hand's vertices, [V, 3], without the light of any frame."""
+    canonical = hand.v_posed if hand.v_posed.ndim == 2 else hand.v_posed.mean(0)
+    if side == "left":
+        canonical = mirror_points(canonical)
+    return _surface_colors(canonical, hand.splats.points, hand.splats.colors)
+
+
+def _object_colors(obj: ObjectPlayback) -> Tensor:
+    """The colours of the object's vertices, [V, 3], without the light of any frame."""
+    return _surface_colors(obj.verts, obj.splats.means, obj.splats.colors)
 
 
 def _surface_colors(verts: Tensor, means: Tensor, colors: Tensor) -> Tensor:

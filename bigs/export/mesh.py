@@ -44,23 +44,34 @@ def save_mesh(
     if colors is not None:
         check_shape(f"{path}: colors", colors, (len(verts), 3))
         check_finite(f"{path}: colors", colors)
-        bytes_per_vertex = np.round(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8)
+        bytes_per_vertex = _bytes(colors)
     mesh = trimesh.Trimesh(verts, faces, vertex_colors=bytes_per_vertex, process=False)
     content: Any = mesh.export(file_type=kind)
     with atomic_write(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
-def save_meshes(path: str | Path, meshes: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+def save_meshes(
+    path: str | Path,
+    meshes: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    colors: Mapping[str, np.ndarray],
+) -> None:
     """Write several meshes as one OBJ file with an object for each name; `path` is whole or absent.
 
     Args:
         path: the .obj file.
         meshes: name -> vertices [V, 3] metres, written as they are, and faces [F, 3].
+        colors: name -> one colour per vertex, [V, 3] in [0, 1]: three more numbers in its line, which most
+            programs read.
     """
     scene = trimesh.Scene()
     for name, (verts, faces) in meshes.items():
-        scene.add_geometry(trimesh.Trimesh(verts, faces, process=False), geom_name=name)
+        mesh = trimesh.Trimesh(verts, faces, vertex_colors=_bytes(colors[name]), process=False)
+        scene.add_geometry(mesh, geom_name=name)
     content: Any = scene.export(file_type="obj")
     with atomic_write(path) as file:
         file.write(content.encode())
+
+
+def _bytes(colors: np.ndarray) -> np.ndarray:
+    return np.round(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from command_line import Answer, Run, assert_refused
 from glb_reader import Glb
@@ -133,6 +134,15 @@ def test_obj(playback: Playback, tmp_path: Path) -> None:
     read = trimesh.load(path, process=False, maintain_order=True)
     np.testing.assert_allclose(read.vertices, np.concatenate(wanted), atol=1e-6)
     assert len(read.faces) == sum(map(len, [*trajectory.faces.values(), trajectory.object_faces]))
+    # Each vertex has the colours of Gaussians near it.
+    colors = read.visual.vertex_colors[:, :3] / 255
+    splats = playback.object.splats
+    shown = colors[-len(playback.object.verts) :]
+    distance = torch.cdist(playback.object.verts, splats.means)
+    near = splats.colors[distance.topk(4, largest=False).indices].mean(1).clamp(0, 1).numpy()
+    assert np.abs(shown - near).max() < 0.01 and shown.std(0).max() > 0.05
+    skin = colors[: -len(playback.object.verts)]
+    assert (skin[:, 0] > skin[:, 2] + 0.1).mean() > 0.9
 
 
 def test_rerun(playback: Playback, tiny_clip: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_line import Answer, Run
+from command_line import Answer, Run, assert_refused
 from PIL import Image
 
 from bigs.commands.formats import FORMATS
@@ -137,6 +138,22 @@ def test_straight_colors() -> None:
     assert rgba[0, 2, :3].tolist() == [51, 102, 255]
 
 
+WRITTEN = {
+    "ply": ["gaussians/hand.ply", "gaussians/object.ply"],
+    "spz": ["gaussians/frame_0006.spz"],
+    "splat-glb": ["gaussians/frame_0006.glb"],
+    "glb": ["scene.glb"],
+    "obj": ["meshes/frame_0006.obj"],
+    "rerun": ["NAME.rrd"],
+    "poses": ["poses.npz"],
+    "mano": ["mano.npz"],
+    "arctic": ["arctic.npz"],
+    "challenge": ["arctic_preds/NAME.pt"],
+    "mesh": ["meshes/object.ply"],
+    "hand-meshes": [f"meshes/{side}_{t:04d}.ply" for side in ("left", "right") for t in range(12)],
+}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS)
 def test_export(
@@ -146,26 +163,43 @@ def test_export(
     answer = call("export", finished_run.folder, "--format", format, "--out", out)
     assert answer.code == 0 and answer.err == ""
     written = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
-    expected = {
-        "ply": ["gaussians/hand.ply", "gaussians/object.ply"],
-        "spz": ["gaussians/frame_0006.spz"],
-        "splat-glb": ["gaussians/frame_0006.glb"],
-        "glb": ["scene.glb"],
-        "obj": ["meshes/frame_0006.obj"],
-        "rerun": [f"{tiny.name}.rrd"],
-        "poses": ["poses.npz"],
-        "mano": ["mano.npz"],
-        "arctic": ["arctic.npz"],
-        "challenge": [f"arctic_preds/{tiny.name}.pt"],
-        "mesh": ["meshes/object.ply"],
-        "hand-meshes": sorted(f"meshes/{side}_{t:04d}.ply" for side in ("left", "right") for t in range(12)),
-    }
-    assert written == expected[format]
+    assert written == [name.replace("NAME", tiny.name) for name in WRITTEN[format]]
     assert str(out / written[0]) in answer.out or format == "hand-meshes"
     if format in ("ply", "poses", "challenge", "mesh"):  # those that every run has
         for name in written:
             original = (finished_run.folder / name).read_bytes()
             assert len((out / name).read_bytes()) == len(original)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_documentation_names_the_files(format: str) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "viewing.md").read_text()
+    (row,) = [line for line in page.splitlines() if line.startswith(f"| `{format}` |")]
+    told = re.findall("`([^`]+)`", row.split("|")[2])
+    # A name without a folder lies where the first one does.
+    told = [name if "/" in name else str(Path(told[0]).parent / name) for name in told]
+    assert {re.sub(r"\d{4}", "0000", name) for name in WRITTEN[format]} <= set(told)
+
+
+@pytest.mark.slow
+def test_formats_add_up(call: Callable[..., Answer], finished_run: Run, tmp_path: Path) -> None:
+    command = ("export", finished_run.folder, "--out", tmp_path)
+    answer = call(*command, "--format", "ply", "--format", "glb", "--format", "ply")
+    assert (answer.code, answer.err) == (0, "")
+    names = [*WRITTEN["ply"], *WRITTEN["glb"]]
+    assert answer.out.split() == [str(tmp_path / name) for name in names]
+    assert all((tmp_path / name).is_file() for name in names)
+
+
+@pytest.mark.slow
+def test_nothing_is_written_if_one_format_cannot_be(
+    call: Callable[..., Answer], finished_run: Run, tmp_path: Path
+) -> None:
+    command = ("export", finished_run.folder, "--out", tmp_path)
+    answer = call(*command, "--format", "ply", "--format", "glb", "--frames", "1")
+    assert_refused(answer, "frames", "ply, spz", "found glb")
+    assert_refused(call(*command), "--format", "ply, spz", "found none")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
