@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import reprlib
 import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +37,12 @@ ROTATION_TOLERANCE = 1e-3
 _SHOWN = 80
 _BRIEFLY = reprlib.Repr()
 _BRIEFLY.maxlevel, _BRIEFLY.maxstring, _BRIEFLY.maxother, _BRIEFLY.maxlong = 3, _SHOWN, _SHOWN, _SHOWN
+# Longer lists of accepted names than this are not recited where one of them is near enough.
+_MOST_RECITED = 12
+# How alike two names must be, 0 to 1, to be taken for each other.
+_ALIKE = 0.6
+# Of larger folders not every file is compared with one that is not there.
+_MOST_NEIGHBOURS = 1000
 
 
 class InputError(ValueError):
@@ -99,13 +108,6 @@ def check_pixels(name: str, width: int, height: int, most: int = MAX_PIXELS) -> 
         raise InputError(f"{name}: expected at most {most} pixels, found {width} x {height}")
 
 
-def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
-    """Raise `InputError` unless `value` is one of `choices`."""
-    accepted = list(choices)
-    if value not in accepted:
-        raise InputError(f"{name}: expected one of {', '.join(map(str, accepted))}, found {shown(value)}")
-
-
 def shown(value: Any) -> str:
     """Somebody else's value for a message: one line, short, and without an exception whatever it is.
 
@@ -121,3 +123,58 @@ def shown(value: Any) -> str:
     except Exception:  # a value may raise whatever it likes
         return f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+
+
+def check_choice(name: str, value: Any, choices: Iterable[Any], kind: str = "names") -> None:
+    """Raise `InputError` unless `value` is one of `choices`; the message says which one is nearest.
+
+    Args:
+        name: what to call the value in the message; include the file when there is one.
+        value: what was given.
+        choices: what is accepted.
+        kind: what the choices are ("terms"), for lists that are too long to be recited.
+    """
+    accepted = list(choices)
+    if value not in accepted:
+        raise InputError(f"{name}: {expected_among(value, accepted, kind)}")
+
+
+def expected_among(value: Any, choices: Iterable[Any], kind: str = "names") -> str:
+    """What a sentence says of a value that is none of the choices: what was expected, found, and meant."""
+    names = [str(choice) for choice in choices]
+    near = nearest(value, names)
+    recited = ", ".join(names) if len(names) <= _MOST_RECITED or not near else f"{len(names)} {kind}"
+    return f"expected one of {recited}, found {shown(value)}{meant(near)}"
+
+
+def nearest(value: Any, choices: Iterable[Any]) -> str | None:
+    """The choice that was probably meant; None when none is alike."""
+    names = {str(choice).lower(): str(choice) for choice in choices}
+    word = shown(value).strip("'\"").lower()
+    found = difflib.get_close_matches(word, names, 1, _ALIKE)
+    if not found and len(word) > 2:
+        found = [name for name in names if name.startswith(word)][:1]
+    return names[found[0]] if found else None
+
+
+def meant(name: str | None) -> str:
+    """The end of a sentence that asks whether `name` was meant; empty for None."""
+    return "" if name is None else f"; did you mean {name}?"
+
+
+def found_at(path: Path) -> str:
+    """What lies at a path where something else was expected: "a file", "a folder", or "nothing" with
+    the neighbour that was probably meant."""
+    if path.is_dir():
+        return "a folder"
+    return "a file" if path.exists() else f"nothing{meant(neighbour(path))}"
+
+
+def neighbour(path: str | Path) -> str | None:
+    """The file or folder beside a missing one that was probably meant."""
+    folder = Path(path).parent
+    try:
+        near = nearest(Path(path).name, [entry.name for entry in islice(folder.iterdir(), _MOST_NEIGHBOURS)])
+    except (OSError, ValueError):
+        return None
+    return None if near is None else str(folder / near)

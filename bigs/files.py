@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import yaml
 
-from bigs.checks import InputError, shown
+from bigs.checks import InputError, meant, neighbour, shown
 
 MIB = 1 << 20
 # JSON for 2000 frames of keypoints of two hands is 8 MB; parsed, a file takes some twenty times its size.
@@ -217,7 +217,7 @@ def _check(found: os.stat_result, path: str | Path, what: str, most: int) -> Non
 def _no_file(error: OSError | ValueError, path: str | Path) -> str:
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.ENOENT, errno.ENOTDIR) or number is None:
-        return "no such file"
+        return f"no such file{meant(neighbour(path))}"
     # What Windows says of folders, and a socket of being opened.
     if number in (errno.EACCES, errno.ENXIO) and not os.path.isfile(path):
         return "no regular file"

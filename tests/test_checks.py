@@ -1,10 +1,12 @@
 """The checks at the border say what, where, expected and found, in one sentence."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from bigs.checks import InputError, check_choice, check_finite, check_shape
+from bigs.checks import InputError, check_choice, check_finite, check_shape, found_at
 
 
 def message(check, *arguments) -> str:
@@ -54,3 +56,32 @@ def test_choices() -> None:
 
 def test_an_input_error_is_a_value_error() -> None:
     assert issubclass(InputError, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("value", "choices", "words"),
+    [
+        ("fst", ["fast", "full"], "expected one of fast, full, found 'fst'; did you mean fast?"),
+        ("zzz", ["fast", "full"], "expected one of fast, full, found 'zzz'"),
+        (
+            "contct",
+            ["contact", *"abcdefghijkl"],
+            "expected one of 13 terms, found 'contct'; did you mean contact?",
+        ),
+        ("zzz", list("abcdefghijklm"), "expected one of a, b, c, d, e, f, g, h, i, j, k, l, m, found 'zzz'"),
+        ("PLY", ["ply"], "expected one of ply, found 'PLY'; did you mean ply?"),
+        (3, [1, 2], "expected one of 1, 2, found 3"),
+    ],
+)
+def test_the_nearest_choice_is_named(value: object, choices: list[object], words: str) -> None:
+    with pytest.raises(InputError) as refused:
+        check_choice("x", value, choices, kind="terms")
+    assert str(refused.value) == f"x: {words}"
+
+
+def test_the_nearest_neighbour_of_a_missing_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").touch()
+    assert found_at(tmp_path / "camera.json") == f"nothing; did you mean {tmp_path / 'cameras.json'}?"
+    assert found_at(tmp_path / "zzz") == found_at(tmp_path / "none" / "camera.json") == "nothing"
+    assert found_at(tmp_path) == "a folder"
+    assert found_at(tmp_path / "cameras.json") == "a file"

@@ -9,14 +9,16 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
 
 from bigs import __version__
-from bigs.checks import InputError, shown
+from bigs.checks import InputError, nearest, shown
 from bigs.cli import batch, bench, clips, preprocess, prior, runs, scores
 from bigs.cli.terminal import fail, say, until_nobody_reads
+from bigs.cli.typos import check_words
 
 Commands = Mapping[str, "Callable[..., None] | Commands"]
 
@@ -78,7 +80,9 @@ def main(arguments: list[str] | None = None) -> None:
         if given == ["--version"]:
             say(f"bigs {__version__}")
         else:
-            _parse(_in_full(given))()
+            words = _in_full(given)
+            check_words(COMMANDS, words)
+            _parse(words)()
     except KeyboardInterrupt:
         fail("interrupted; --resume continues from the last checkpoint", 130)
     except Exception as error:
@@ -107,13 +111,15 @@ def _told(error: Exception) -> tuple[str, int]:
 
 
 def _in_full(arguments: list[str]) -> list[str]:
-    """The arguments with the command that a group stands for when none of its own follows its name."""
+    """The arguments with the command that a group stands for when none of its own follows its name, nor what
+    is nearly one."""
     if len(arguments) < 2 or arguments[0] not in IMPLIED or arguments[1] in ("--help", "-h"):
         return arguments
     group, *others = arguments
     commands = COMMANDS[group]
     assert not callable(commands)
-    return arguments if others[0] in commands else [group, IMPLIED[group], *others]
+    misspelt = nearest(others[0], commands) and not Path(others[0]).exists()
+    return arguments if others[0] in commands or misspelt else [group, IMPLIED[group], *others]
 
 
 def _parse(arguments: list[str]) -> Callable[[], None]:

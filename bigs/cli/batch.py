@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import tyro
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_choice
 from bigs.cli.terminal import Preset, fail_for, print_table, say, settings_of, stderr
 
 if TYPE_CHECKING:
@@ -67,8 +67,8 @@ def batch(
 
     def config_of(entry: Entry) -> RunConfig:
         where = f"{manifest}: {entry.name}: preset"
-        if entry.preset is not None and entry.preset not in PRESETS:
-            raise InputError(f"{where}: expected one of {', '.join(PRESETS)}, found {entry.preset!r}")
+        if entry.preset is not None:
+            check_choice(where, entry.preset, PRESETS)
         if entry.preset is not None and entry.config is not None:
             raise InputError(f"{where}: expected a preset or a config, found both")
         own = cast(Preset | None, entry.preset)

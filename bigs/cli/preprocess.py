@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.cli.terminal import say, stderr, use_threads
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ def clip_of(clip: Path, out: Path, options: VideoOptions, hand_model: Path | Non
         if options.given():
             raise InputError(
                 f"{clip}: expected a video or a folder of images for {', '.join(options.given())}, "
-                f"found {'a clip or another folder' if clip.exists() else 'nothing'}"
+                f"found {'a clip or another folder' if clip.is_dir() else found_at(clip)}"
             )
         return clip
     folder = out / "clip"

@@ -11,7 +11,7 @@ import bigs
 from bigs.atomic import atomic_write
 from bigs.bench.machine import machine_facts
 from bigs.bench.page import Table, page
-from bigs.checks import InputError
+from bigs.checks import InputError, check_choice
 from bigs.commands.clips import open_estimates
 from bigs.commands.run_folder import write_json
 from bigs.commands.series import FinishedRun, PlannedRun, check_folders, run_or_reuse
@@ -81,9 +81,7 @@ def parse_rows(names: Iterable[str]) -> list[Row]:
     for name in chain.from_iterable(name.split(",") for name in names):
         off = tuple(dict.fromkeys(name.split("+"))) if name != FULL else ()
         for what in off:
-            if what not in SWITCHES:
-                known = ", ".join((FULL, *SWITCHES))
-                raise InputError(f"--rows {name}: expected names out of {known}, found {what!r}")
+            check_choice(f"--rows {name}", what, (FULL, *SWITCHES), "ingredients and loss terms")
         rows.setdefault(frozenset(off), Row(off))
     return list(rows.values())
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.commands.preprocess_pictures import draw_clip, tinted, with_skeletons, write_sheet
 from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome, kept
 from bigs.data.base import HandTrack
@@ -181,7 +181,7 @@ def hand_source(request: PreprocessRequest) -> tuple[str, Path] | None:
         return None
     option, source = given[0]
     if not source.exists():
-        raise InputError(f"{source}: expected a file for {option}, found nothing")
+        raise InputError(f"{source}: expected a file for {option}, found {found_at(source)}")
     return option, source
 
 

@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.commands.prior import read_state, state_path
 from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
@@ -116,7 +116,7 @@ def train_prior(
 
 def _mesh_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of meshes, found no such folder")
+        raise InputError(f"{folder}: expected a folder of meshes, found {found_at(folder)}")
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
     if not files:
         raise InputError(f"{folder}: expected meshes ({', '.join(_SUFFIXES)}), found none")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.models.playback import Playback
 from bigs.models.playback_file import load_playback
 
@@ -29,7 +29,7 @@ def load_run(run: Path) -> Playback:
         InputError: no such folder, or the run has not finished.
     """
     if not run.is_dir():
-        raise InputError(f"{run}: expected a run folder, found {'a file' if run.exists() else 'nothing'}")
+        raise InputError(f"{run}: expected a run folder, found {found_at(run)}")
     return load_playback(run / SCENE)
 
 

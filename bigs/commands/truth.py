@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.data.annotation import Annotation
 from bigs.data.arctic import find_arctic, read_arctic
 from bigs.data.ground_truth import load_ground_truth
@@ -78,7 +78,7 @@ def read_annotation(
         return read_arctic(sequence, frame_names)
     raise InputError(
         f"{path}: expected gt.npz, a folder that holds it, an ARCTIC raw sequence or an HO-3D clip, found "
-        f"{'another folder' if path.is_dir() else 'nothing'}"
+        f"{'another folder' if path.is_dir() else found_at(path)}"
     )
 
 

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.fields import array_field, mapping_field, number_field, require
 from bigs.data.images import (
@@ -167,7 +167,7 @@ def shift_before(center_cam: np.ndarray) -> np.ndarray:
 
 def _build_folder(path: Path) -> Path:
     if not path.is_dir():
-        raise InputError(f"{path}: expected a clip folder, found {'a file' if path.exists() else 'nothing'}")
+        raise InputError(f"{path}: expected a clip folder, found {found_at(path)}")
     return path / "build" if (path / "build").is_dir() else path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.names import check_name
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
@@ -27,9 +27,7 @@ def list_frames(folder: Path, suffixes: Sequence[str]) -> tuple[Path, ...]:
         InputError: the folder is missing or holds no such file, or one whose name other systems refuse.
     """
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: expected a folder of frames, found {'a file' if folder.exists() else 'nothing'}"
-        )
+        raise InputError(f"{folder}: expected a folder of frames, found {found_at(folder)}")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     if not paths:
         raise InputError(f"{folder}: expected frames ({', '.join(suffixes)}), found none")

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.data.arctic import find_arctic, load_arctic
 from bigs.data.base import Clip
 from bigs.data.ho3d import find_ho3d, load_ho3d
@@ -38,7 +38,7 @@ def layout_of(path: str | Path) -> Layout:
         return "ho3d"
     if find_arctic(path) is not None:
         return "arctic"
-    found = "a file" if path.is_file() else "another folder" if path.is_dir() else "nothing"
+    found = "another folder" if path.is_dir() else found_at(path)
     raise InputError(f"{path}: expected a clip folder ({', '.join(LAYOUT_NAMES.values())}), found {found}")
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError, shown
+from bigs.checks import ARCHIVE_ERRORS, InputError, meant, neighbour, shown
 from bigs.export.challenge import validate_challenge
 from bigs.types import ENTITIES
 
@@ -87,7 +87,9 @@ def check_submission(path: str | Path, sequences: Sequence[str] = TEST_SEQUENCES
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: expected a submission (a zip file), found no such file")
+        raise InputError(
+            f"{path}: expected a submission (a zip file), found no such file{meant(neighbour(path))}"
+        )
     return _check_archive(str(path), io.BytesIO(path.read_bytes()), sequences)
 
 

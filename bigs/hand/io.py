@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 
 from bigs.archives import read_npz
-from bigs.checks import InputError, check_choice, check_finite, check_shape
+from bigs.checks import InputError, check_choice, check_finite, check_shape, found_at
 from bigs.files import open_regular
 from bigs.hand.model import MANO_PARENTS, HandModel
 from bigs.hand.procedural import procedural_hand
@@ -76,7 +76,7 @@ def load_hand_model(path: str | Path, side: Side) -> HandModel:
         )
     if not file.is_file():
         raise InputError(
-            f"{file}: expected a hand model file (.npz or .pkl) or a folder of them, found nothing"
+            f"{file}: expected a hand model file (.npz or .pkl) or a folder of them, found {found_at(file)}"
         )
     return hand_model_from_fields(read_model_file(file), side, name=str(file))
 

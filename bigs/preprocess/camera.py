@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.colmap import pycolmap
 from bigs.data.arctic import camera_of_images
 from bigs.preprocess.source import Source
@@ -100,7 +100,7 @@ def _centred(focal: float, width: int, height: int) -> np.ndarray:
 def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     """The first camera of a COLMAP model; another image size of the same proportions is scaled."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected the folder of a COLMAP model, found no such folder")
+        raise InputError(f"{folder}: expected the folder of a COLMAP model, found {found_at(folder)}")
     try:
         cameras = pycolmap.Reconstruction(str(folder)).cameras
     except (ValueError, RuntimeError, OSError) as error:

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 from bigs.preprocess.artefacts import MASKS, MASKS_FILE, FrameSet, write_json
 from bigs.preprocess.matching import match_names
 from bigs.preprocess.source import PICTURE_SUFFIXES, natural_order
@@ -52,9 +52,7 @@ def open_masks(folder: Path, frames: FrameSet, labels: Mapping[Entity, int] | No
         InputError: no such folder, no known layout, or a number of masks that fits no frames.
     """
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: expected a folder of masks, found {'a file' if folder.exists() else 'nothing'}"
-        )
+        raise InputError(f"{folder}: expected a folder of masks, found {found_at(folder)}")
     entities = _entity_folders(folder, labels)
     if entities:
         return _folders_source(entities, frames)

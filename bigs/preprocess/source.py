@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from bigs.checks import InputError
+from bigs.checks import InputError, found_at
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -84,7 +84,7 @@ def open_source(path: Path) -> Source:
         images = tuple(sorted(files, key=natural_order))
         return Source(path, FOLDER_FPS, exif=_exif(images[0]), images=images)
     if not path.is_file():
-        raise InputError(f"{path}: expected a video file or a folder of images, found nothing")
+        raise InputError(f"{path}: expected a video file or a folder of images, found {found_at(path)}")
     av = _import_av(path)
     try:
         with av.open(str(path)) as container:

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, shown
+from bigs.checks import InputError, check_choice, meant, nearest, shown
 from bigs.files import parse_yaml, read_yaml
 from bigs.train.config import RunConfig
 from bigs.train.ranges import check_ranges
@@ -66,12 +66,16 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
             is_last = depth == len(keys) - 1
             may_be_new = bool(key) and is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
             if not separator or not isinstance(node, dict) or not (key in node or may_be_new):
-                known = f"; there are {', '.join(node)}" if isinstance(node, dict) else ""
-                raise InputError(f"--set {change}: expected path=value, found no setting {key!r}{known}")
+                if not separator or not isinstance(node, dict):
+                    raise InputError(f"--set {change}: expected path=value, found no setting {key!r}")
+                check_choice(f"--set {change}", key, node, "settings")
             if not is_last:
                 node = node[key]
         node[keys[-1]] = _scalar(change, text)
-    return from_plain(plain, "--set")
+    try:
+        return from_plain(plain, "--set")
+    except InputError as error:
+        raise InputError(str(error).replace("--set.", "--set ", 1)) from None
 
 
 def _scalar(change: str, text: str) -> Any:
@@ -112,10 +116,7 @@ def _build(kind: Any, plain: Any, where: str) -> Any:
     if origin is types.UnionType:  # a setting that may be absent
         return None if plain is None else _build(arguments[0], plain, where)
     if origin is typing.Literal:
-        if plain not in arguments:
-            raise InputError(
-                f"{where}: expected one of {', '.join(map(str, arguments))}, found {shown(plain)}"
-            )
+        check_choice(where, plain, arguments)
         return plain
     if origin is tuple:
         return _build_tuple(arguments, plain, where)
@@ -164,8 +165,7 @@ def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
         raise InputError(f"{where}: expected a mapping, found {shown(plain)}")
     hints = typing.get_type_hints(kind)
     for key in plain:
-        if key not in hints:
-            raise InputError(f"{where}: expected keys out of {', '.join(hints)}, found {shown(key)}")
+        check_choice(where, key, hints, "keys")
     required = [
         f.name
         for f in dataclasses.fields(kind)
@@ -174,4 +174,19 @@ def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
     for key in required:
         if key not in plain:
             raise InputError(f"{where}: expected a key {shown(key)}, found {', '.join(plain) or 'nothing'}")
-    return kind(**{key: _build(hints[key], value, f"{where}.{key}") for key, value in plain.items()})
+    return kind(**{key: _build_field(hints, key, value, where) for key, value in plain.items()})
+
+
+def _build_field(hints: dict[str, Any], key: str, value: Any, where: str) -> Any:
+    """The value of a field; where it would suit another of nearly that name, the refusal says so."""
+    try:
+        return _build(hints[key], value, f"{where}.{key}")
+    except InputError as error:
+        other = nearest(key, (name for name in hints if name != key))
+        if other is None or dataclasses.is_dataclass(hints[other]):
+            raise
+        try:
+            _build(hints[other], value, where)
+        except InputError:
+            raise error from None
+        raise InputError(f"{error}{meant(other)}") from None

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bigs.checks import InputError
+from bigs.checks import InputError, expected_among
 from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
@@ -119,8 +119,8 @@ def run_stage(
     image_terms = IMAGE_TERMS[stage.step]
     unknown = [name for name in stage.weights if name not in TERMS and name not in image_terms]
     if unknown:
-        accepted = ", ".join([*image_terms, *TERMS])
-        raise InputError(f"stage {stage.name}: expected terms out of {accepted}, found {unknown[0]!r}")
+        accepted = expected_among(unknown[0], [*image_terms, *TERMS], "terms")
+        raise InputError(f"stage {stage.name}: {accepted}")
     if "perceptual" in stage.weights and evidence.perceptual is None:
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)

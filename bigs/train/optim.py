@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
-from bigs.checks import InputError
+from bigs.checks import InputError, expected_among
 from bigs.models.scene import Scene
 
 _LIGHT = {"light": "clip", "shade": "shade"}
@@ -42,7 +42,7 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
         InputError: there is no such group.
     """
     if group not in GROUPS:
-        raise InputError(f"stage lrs: expected groups out of {', '.join(GROUPS)}, found {group!r}")
+        raise InputError(f"stage lrs: {expected_among(group, GROUPS, 'groups')}")
     subject, name = group.split(".")
     if subject == "scene":
         owners = [] if scene.lighting is None else [getattr(scene.lighting, _LIGHT[name])]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_choice
 from bigs.train.config import (
     CompletionStage,
     GuidanceStage,
@@ -55,8 +55,7 @@ def _check_names(where: str, stage: OptimizeStage) -> None:
     accepted = (*IMAGE_TERMS[stage.step], *TERMS)
     for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
         for name in given:
-            if name not in known:
-                raise InputError(f"{where}: expected {kind} out of {', '.join(known)}, found {name!r}")
+            check_choice(where, name, known, kind)
 
 
 def _check_densify(

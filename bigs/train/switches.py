@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_choice
 from bigs.train.config import (
     CompletionStage,
     GraspStage,
@@ -38,8 +38,7 @@ def without(config: RunConfig, what: str) -> RunConfig:
     Raises:
         InputError: there is no such ingredient.
     """
-    if what not in SWITCHES:
-        raise InputError(f"--without: expected names out of {', '.join(SWITCHES)}, found {what!r}")
+    check_choice("--without", what, SWITCHES, "ingredients and loss terms")
     return SWITCHES[what].off(config)
 
 

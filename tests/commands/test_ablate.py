@@ -44,7 +44,7 @@ def test_rows_as_they_are_asked_for() -> None:
         Row(("lighting",)),
         Row(("smooth", "contact")),
     ]
-    with pytest.raises(InputError, match=r"--rows share\+blur: expected names out of full, share, .*'blur'"):
+    with pytest.raises(InputError, match=r"--rows share\+blur: expected one of full, share, .*'blur'"):
         parse_rows(["share+blur"])
 
 

@@ -222,7 +222,7 @@ def test_a_broken_configuration(call: Callable[..., Answer], tiny_clip: Path, tm
     file = tmp_path / "old.yaml"
     file.write_text("config:\n  sede: 1\n")
     answer = call("reconstruct", tiny_clip, "--out", tmp_path / "out", "--config", file)
-    assert_refused(answer, "old.yaml: ", "expected keys out of seed", "found 'sede'")
+    assert_refused(answer, "old.yaml: ", "expected one of seed", "found 'sede'; did you mean seed?")
     assert not (tmp_path / "out").exists()
 
 

@@ -104,10 +104,10 @@ def test_wrong_fields(tmp_path: Path, arrays: dict[str, Any], words: str) -> Non
 
 
 def test_missing_and_damaged_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gt\.npz.*no such file"):
+    with pytest.raises(InputError, match=r"gt\.npz.*found no such file"):
         load_ground_truth(tmp_path)
     file = write_ground_truth(tmp_path, arrays=truth_arrays(), object_mesh=None)
-    with pytest.raises(InputError, match=r"gt_object\.ply.*no such file"):
+    with pytest.raises(InputError, match=r"gt_object\.ply.*found no such file"):
         load_ground_truth(file)
     (tmp_path / "gt_object.ply").write_text("ply\nnonsense")
     with pytest.raises(InputError, match=r"gt_object\.ply.*triangle mesh"):

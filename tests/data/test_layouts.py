@@ -147,7 +147,7 @@ def edit_json(file: Path, change: Callable[[dict], None]) -> None:
     [
         (
             lambda r: (r / "meta" / "misc.json").unlink(),
-            "misc.json: expected a misc.json, found no such file",
+            "misc.json: expected ARCTIC",
         ),
         (lambda r: (r / "meta" / "misc.json").write_text("{"), "misc.json: expected JSON"),
         (

@@ -141,7 +141,7 @@ def test_what_is_wrong(tmp_path: Path, content: Any, words: str) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="found no such file"):
         load_cameras(tmp_path / "none.json", frame_count=5)
 
 

@@ -40,8 +40,8 @@ def plain() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (("sed",), 1, r"^f\.yaml: expected keys out of seed, .*found 'sed'"),
-        (("raster", "eps2"), 1, r"^f\.yaml\.raster: expected keys out of .*eps2d.*found 'eps2'"),
+        (("sed",), 1, r"^f\.yaml: expected one of seed, .*found 'sed'; did you mean seed"),
+        (("raster", "eps2"), 1, r"^f\.yaml\.raster: expected one of .*eps2d.*found 'eps2'; did you mean"),
         (("raster", "eps2d"), "wide", r"^f\.yaml\.raster\.eps2d: expected float, found 'wide'"),
         (("raster", "eps2d"), True, r"^f\.yaml\.raster\.eps2d: expected float, found True"),
         (("raster", "tile_size"), 16.5, r"^f\.yaml\.raster\.tile_size: expected int, found 16\.5"),
@@ -59,10 +59,10 @@ def plain() -> dict[str, Any]:
             r"stages\.joint\.step: expected one of single-subject, .*'both'",
         ),
         (("stages", "joint", "steps"), "many", r"stages\.joint\.steps: expected int, found 'many'"),
-        (("stages", "joint", "stepz"), 5, r"stages\.joint: expected keys out of .*steps.*found 'stepz'"),
+        (("stages", "joint", "stepz"), 5, r"stages\.joint: expected one of .*'stepz'; did you mean step"),
         (("stages", "joint", "lrs"), 5, r"stages\.joint\.lrs: expected a mapping, found 5"),
         (("stages", "joint", "lrs", "hand.ray"), "fast", r"stages\.joint\.lrs\.hand\.ray: expected float"),
-        (("stages", "object-scale-search", "spam"), 1, r"object-scale-search: expected keys .*span.*'spam'"),
+        (("stages", "object-scale-search", "spam"), 1, r"object-scale-search: expected .*span.*'spam'"),
         (("stages", "object-scale-search", "span"), "x", r"object-scale-search\.span: expected float"),
     ],
 )

@@ -57,7 +57,7 @@ def test_field_groups_are_what_a_canonical_subject_depends_on(both_hands: dict[S
 
 
 def test_an_unknown_group_is_named(both_hands: dict[Side, HandModel]) -> None:
-    with pytest.raises(InputError, match=r"expected groups out of .*hand\.ray.*found 'hand\.rays'"):
+    with pytest.raises(InputError, match=r"expected one of .* groups, found 'hand\.rays'"):
         make_optimizer(cube_scene(both_hands), {"hand.rays": 0.1})
 
 
