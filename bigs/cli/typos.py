@@ -80,7 +80,7 @@ def words_of(command: Callable[..., Any]) -> tuple[list[Word], list[Word]]:
             name = parameter.name.replace("_", "-")
             most = 1 if tyro.conf.UseAppendAction in said else _most(kind)
             options.append(Word(f"--{name}", kind, most, required))
-            if kind is bool:
+            if kind is bool and tyro.conf.FlagCreatePairsOff not in said:
                 options.append(Word(f"--no-{name}", kind, most, False))
     return options, places
 

@@ -20,7 +20,7 @@ from bigs.train.terms import TERMS
 
 @pytest.mark.parametrize("stage", [ALONE, TOGETHER], ids=lambda stage: stage.name)
 def test_an_unknown_term_is_named(scene: Scene, evidence: Evidence, stage: OptimizeStage) -> None:
-    with pytest.raises(InputError, match=rf"stage {stage.name}: expected terms out of .*found 'imagee'"):
+    with pytest.raises(InputError, match=rf"stage {stage.name}: expected one of .* terms, found 'imagee'"):
         run_stage(scene, replace(stage, weights={"imagee": 1.0}), evidence, 0)
 
 
