@@ -20,7 +20,7 @@ from bigs.cli.typos import check_words, words_of
         ("recnstruct x", "expected one of 15 commands, found 'recnstruct'; did you mean reconstruct?"),
         (
             "bench engin",
-            "bench: expected one of engine, preprocess, reconstruct, ",
+            "found 'engin'; did you mean engine?",
         ),
         ("reconstruct x --out y --presett fast", "found --presett; did you mean --preset?"),
         ("reconstruct x --out y --thread=1", "found --thread; did you mean --threads?"),

@@ -147,7 +147,7 @@ def edit_json(file: Path, change: Callable[[dict], None]) -> None:
     [
         (
             lambda r: (r / "meta" / "misc.json").unlink(),
-            "misc.json: expected ARCTIC",
+            "misc.json: expected a JSON file, found no such file",
         ),
         (lambda r: (r / "meta" / "misc.json").write_text("{"), "misc.json: expected JSON"),
         (
