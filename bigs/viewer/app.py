@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bigs.checks import InputError
+from bigs.viewer.origins import own_pages_only
 from bigs.viewer.stage import Mesh, Splats, Stage
 
 # The page's renderer keeps covariances as 16-bit floats: in metres a millimetre squared would be lost, in
@@ -47,7 +48,7 @@ class Viewer:
             ) from error
         _check_address(host, port)
         # It would print a box with its address.
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), own_pages_only(host):
             self._server = viser.ViserServer(host=host, port=port, label=stage.title, verbose=False)
         self._stage = stage
         self._wake, self._closing, self._ended = threading.Event(), threading.Event(), threading.Event()
