@@ -24,10 +24,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from bigs.archives import read_npz
-from bigs.checks import InputError
+from bigs.checks import InputError, check_finite, check_rotations, shown
 from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.colmap_files import check_model_files
+from bigs.data.fields import array_field, mapping_field, number_field, require
 from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.images import (
     IMAGE_SUFFIXES,
@@ -50,6 +51,8 @@ _MASK_FOLDERS = ("mask", "masks")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 # Intrinsics of one camera, written frame by frame, agree to this many pixels.
 _K_TOLERANCE = 1e-3
+# Of the image's side: a shorter focal length sees more than 179.8 degrees.
+_LEAST_FOCAL = 1e-3
 
 
 class SfmModel(NamedTuple):
@@ -152,6 +155,7 @@ def _read_colmap(folder: Path, size: tuple[int, int]) -> SfmModel:
     place = _model_folder(folder)
     if place is None:
         raise InputError(f"{folder}: expected {TRANSFORMS_FILE} or a COLMAP model in sparse/0, found neither")
+    check_model_files(place)
     try:
         model = pycolmap.Reconstruction(str(place))
     except Exception as error:  # pycolmap raises what its C++ throws
@@ -176,13 +180,30 @@ def _read_colmap(folder: Path, size: tuple[int, int]) -> SfmModel:
         poses[Path(image.name).stem] = np.vstack(
             [(pose() if callable(pose) else pose).matrix(), [0, 0, 0, 1]]
         )
+        check_rotations(f"{place}: pose of image {shown(image.name)}", poses[Path(image.name).stem][:3, :3])
+        check_finite(f"{place}: pose of image {shown(image.name)}", poses[Path(image.name).stem])
+    K = array_field(f"{place}: camera", camera.calibration_matrix(), (3, 3))
+    _check_lens(f"{place}: camera", K, size)
     points = list(model.points3D.values())
     return SfmModel(
-        K=camera.calibration_matrix(),
+        K=K,
         poses=poses,
         points=np.array([point.xyz for point in points]).reshape(-1, 3),
         colors=np.array([point.color for point in points]).reshape(-1, 3) / 255.0,
     )
+
+
+def _check_lens(where: str, K: np.ndarray, size: tuple[int, int]) -> None:
+    """A pinhole that sees the image: less than 179.8 degrees, and its middle not far outside."""
+    for axis, name in enumerate(("fx", "fy")):
+        if K[axis, axis] < _LEAST_FOCAL * size[axis]:
+            raise InputError(f"{where}: {name}: expected a positive focal length, found {K[axis, axis]:g}")
+    for axis, name in enumerate(("cx", "cy")):
+        if not -size[axis] <= K[axis, 2] <= 2 * size[axis]:
+            raise InputError(
+                f"{where}: {name}: expected a place in or near the image of {size[0]} x {size[1]}, found "
+                f"{K[axis, 2]:g}"
+            )
 
 
 def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float | None]:
@@ -193,7 +214,7 @@ def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float |
         raise InputError(f"{file}: expected right_transl or left_transl, found {', '.join(arrays)}")
     if "object_scale" not in arrays:
         return hands, None
-    scale = float(array_field(f"{file}: object_scale", np.ravel(arrays["object_scale"]), (1,))[0])
+    scale = number_field(f"{file}: object_scale", arrays["object_scale"])
     if scale <= 0:
         raise InputError(f"{file}: object_scale: expected a positive number, found {scale:g}")
     return hands, scale
@@ -237,26 +258,28 @@ def _object_track(
     scale: float | None,
 ) -> ObjectTrack:
     valid = np.array([stem in model.poses for stem in stems])
+    points = array_field(f"{folder}: points of the model", model.points, ("N", 3))
     if not valid.any():
         raise InputError(
             f"{folder}: expected a model with the images {stems[0]} ..., found none of them in it"
         )
-    if len(model.points) < 4:
-        raise InputError(f"{folder}: expected points that span a volume, found {len(model.points)}")
+    if len(points) < 4:
+        raise InputError(f"{folder}: expected points that span a volume, found {len(points)}")
     poses = np.stack([model.poses.get(stem, np.full((4, 4), np.nan)) for stem in stems])
     rotvecs = np.full((len(stems), 1, 3), np.nan)
     rotvecs[valid, 0] = Rotation.from_matrix(poses[valid, :3, :3]).as_rotvec()
     rotations = Rotation.from_rotvec(fill_rotations(rotvecs, valid)[:, 0]).as_matrix()
     transl = fill_vectors(poses[:, :3, 3], valid)
     if scale is None:
-        middle = np.median(model.points, axis=0)
+        middle = np.median(points, axis=0)
         depths = (rotations @ middle + transl)[:, 2]
         hand_depths = np.mean([track.transl[:, 2] for track in hands.values()], axis=0)
-        scale = float(np.median((hand_depths / depths)[valid]))
-        if scale <= 0:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = float(np.median((hand_depths / depths)[valid]))
+        if not 0.0 < scale < np.inf:
             raise InputError(f"{folder}: expected hands and object before the camera, found one behind it")
     return ObjectTrack(
-        points=model.points,
+        points=points,
         colors=model.colors,
         scale=scale,
         metric_from_canon=np.diag([scale, scale, scale, 1.0]),

@@ -23,6 +23,8 @@ from bigs.checks import InputError, check_finite, check_shape, shown
 from bigs.names import check_name, check_path
 from bigs.types import ENTITIES, SIDES, HandObjectTrajectory, Side
 
+# Keys have two parts.
+_DEEPEST = 4
 # HOLD's axes: x right, y up, z backward.
 _GL_FROM_CV = np.array([1.0, -1.0, -1.0])
 # HOLD's scale is scene_bounding_sphere / (max_radius_ratio |n|), and these two are 6 and 3 by default.
@@ -228,7 +230,10 @@ def _parse(where: str, stream: BinaryIO) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict):
         raise InputError(f"{where}: expected a dictionary, found {type(content).__name__}")
-    flat = dict(_flat(content))
+    try:
+        flat = dict(_flat(content))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     if "faces" in flat:
         raise InputError(f"{where}: faces: expected a dictionary, found {type(flat['faces']).__name__}")
     faces = {key.removeprefix("faces."): flat.pop(key) for key in list(flat) if key.startswith("faces.")}
@@ -238,6 +243,10 @@ def _parse(where: str, stream: BinaryIO) -> dict[str, Any]:
 def _flat(content: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """The leaves of nested dictionaries under dotted keys, which is how the challenge spells them."""
     for key, value in content.items():
+        if not isinstance(key, str):
+            raise InputError(f"expected texts as keys, found {shown(key)}")
+        if isinstance(value, dict) and prefix.count(".") >= _DEEPEST:
+            raise InputError(f"expected dictionaries at most {_DEEPEST} deep, found more in {prefix[:80]}")
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")
         else:

@@ -13,6 +13,10 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_shape
 
 _GAP = 4
+# A cell is at most so many times as high as wide: a sheet of narrow pictures is a picture, not a ribbon.
+_HIGHEST_CELL = 3
+# The encoder's limit for a side is 16384; larger frames are made smaller.
+_VIDEO_SIDE = 8192
 _FONT_SIZE = 14
 _CAPTION_HEIGHT = 22
 _PAPER, _INK, _EMPTY = (255, 255, 255), (20, 20, 20), (236, 236, 236)
@@ -68,7 +72,8 @@ def contact_sheet(
         rows: name of the row -> one image per column, [H, W, 3] uint8 or float in [0, 1]; None leaves the
             cell empty.
         captions: name of each column.
-        cell_width: width in pixels to which every image is scaled, keeping its proportions.
+        cell_width: width in pixels to which every image is scaled, keeping its proportions; one that is very
+            high is narrower.
 
     Raises:
         InputError: a row has another number of images than there are captions, or an image another shape.
@@ -125,7 +130,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
     Args:
         path: an .mp4 file.
         frames: [H, W, 3] uint8 or float in [0, 1], all of one size; read one at a time. An odd width or
-            height is continued by a pixel, because the format needs even ones.
+            height is continued by a pixel, because the format needs even ones; a side beyond 8192 pixels is
+            shrunk to that.
         fps: frames a second.
 
     Raises:
@@ -145,11 +151,16 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
             if stream is None:
                 check_shape(f"{path}: frame 0", pixels, ("H", "W", 3))
                 size = pixels.shape
+                shrink = min(1.0, _VIDEO_SIDE / max(size))
+                shown = [max(1, round(shrink * side)) for side in size[:2]]
                 stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-                stream.height, stream.width = size[0] + size[0] % 2, size[1] + size[1] % 2
+                stream.height, stream.width = (side + side % 2 for side in shown)
                 stream.pix_fmt, stream.options = _PIXEL_FORMAT, {"crf": _QUALITY}
             check_shape(f"{path}: frame {index}", pixels, size)
-            even = np.pad(pixels, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
+            if shrink < 1.0:
+                small = Image.fromarray(pixels).resize((shown[1], shown[0]), Image.Resampling.LANCZOS)
+                pixels = np.asarray(small)
+            even = np.pad(pixels, ((0, shown[0] % 2), (0, shown[1] % 2), (0, 0)), mode="edge")
             container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
         if stream is None:
             raise InputError(f"{path}: expected at least one frame, found none")
@@ -159,8 +170,9 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> N
 def _cell(name: str, image: np.ndarray, width: int) -> Image.Image:
     check_shape(f"contact sheet {name!r}", image, ("H", "W", 3))
     picture = Image.fromarray(to_bytes(image))
-    height = max(1, round(width * picture.height / picture.width))
-    return picture.resize((width, height), Image.Resampling.LANCZOS)
+    scale = min(width / picture.width, _HIGHEST_CELL * width / picture.height)
+    size = (max(1, round(scale * picture.width)), max(1, round(scale * picture.height)))
+    return picture.resize(size, Image.Resampling.LANCZOS)
 
 
 def _fitting(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:

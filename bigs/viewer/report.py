@@ -18,6 +18,8 @@ from bigs.checks import InputError
 from bigs.viewer.plot import line_plot
 
 _JPEG_QUALITY = 88
+# The format's limit for a side.
+_JPEG_SIDE = 65500
 # Of the pictures under the slider, of which there are many.
 _FRAME_QUALITY = 75
 # Keys of a log row that say where it belongs and are no curves themselves.
@@ -200,7 +202,9 @@ def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
 
 def _jpeg(picture: Image.Image, quality: int) -> bytes:
     buffer = io.BytesIO()
-    picture.convert("RGB").save(buffer, "JPEG", quality=quality)
+    picture = picture.convert("RGB")
+    picture.thumbnail((_JPEG_SIDE, _JPEG_SIDE))
+    picture.save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.data.colmap_files import check_model_files
 from bigs.data.layouts import layout_of, load_clip
 from bigs.data.moving import move_hand, move_object
 from bigs.data.sfm_folder import load_sfm_folder
@@ -202,3 +204,41 @@ def test_a_model_of_other_images_is_refused(tmp_path: Path, in_camera: Clip) -> 
             file.unlink()
     with pytest.raises(InputError, match="found none of them in it"):
         load_clip(folder, NO_MEAN)
+
+
+@pytest.fixture
+def binary(tmp_path: Path, in_camera: Clip) -> Path:
+    """The model of a clip, in binary."""
+    place = write_colmap(tmp_path / "clip", in_camera) / "sparse" / "0"
+    model = pycolmap.Reconstruction(str(place))
+    for file in place.iterdir():
+        file.unlink()
+    model.write_binary(str(place))
+    return place
+
+
+def test_a_binary_model_that_is_cut_is_told(binary: Path) -> None:
+    check_model_files(binary)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        file = binary / name
+        content = file.read_bytes()
+        for keep in (0, 5, 30, len(content) // 2, len(content) - 1):
+            file.write_bytes(content[:keep])
+            with pytest.raises(InputError, match=f"{name}: "):
+                load_sfm_folder(binary.parent.parent)
+        # A count that no memory holds, and more than is announced.
+        for wrong in (b"\xff" * 8 + content[8:], content + b"\0"):
+            file.write_bytes(wrong)
+            with pytest.raises(InputError, match=f"{name}: "):
+                load_sfm_folder(binary.parent.parent)
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("focal", [0.0, -100.0, float("nan"), float("inf"), 1e-9])
+def test_a_camera_without_a_focal_length(binary: Path, focal: float) -> None:
+    file = binary / "cameras.bin"
+    content = bytearray(file.read_bytes())
+    struct.pack_into("<d", content, 8 + 24, focal)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"camera"):
+        load_sfm_folder(binary.parent.parent)

@@ -281,3 +281,16 @@ def test_damaged_and_missing_files_are_named(tmp_path, written):
 def test_the_wrong_number_of_names_is_named(written):
     with pytest.raises(InputError, match="expected 2 frames, found 3"):
         load_challenge(written, ("a", "b"))
+
+
+@pytest.mark.parametrize("depth", [8, 200])
+def test_dictionaries_in_dictionaries_are_bounded(tmp_path, depth):
+    nested: dict = {"x": torch.zeros(1)}
+    for _ in range(depth):
+        nested = {"a": nested}
+    torch.save(nested, tmp_path / "deep.pt")
+    with pytest.raises(InputError, match=r"deep\.pt"):
+        load_challenge(tmp_path / "deep.pt")
+    torch.save({1: torch.zeros(1)}, tmp_path / "deep.pt")
+    with pytest.raises(InputError, match=r"deep\.pt: expected texts as keys, found 1"):
+        load_challenge(tmp_path / "deep.pt")

@@ -40,11 +40,11 @@ def test_every_range_is_of_a_number_that_exists() -> None:
         ("object.triplane.resolution=1000000", r"triplane\.resolution: .* found 1000000"),
         ("seed=-1", r"seed: .* found -1"),
         (f"seed={2**63}", rf"seed: expected 0 to {2**63 - 1}, found {2**63}"),
-        (f"seed={10**400}", "seed: .* found an integer of about 401 digits"),
-        ("seed=" + "9" * 5000, "seed=99.* found .99"),
-        (f"raster.eps2d={10**400}", "eps2d: .* found an integer of about 401 digits"),
-        ("seed=2001-99-99", "seed=.*: expected a value"),
-        ("raster.eps2d=" + "[" * 3000, r"raster\.eps2d=.*: expected a value"),
+        (f"seed={10**400}", "seed.*: .* found"),
+        ("seed=" + "9" * 5000, "seed=99.* found"),
+        (f"raster.eps2d={10**400}", "eps2d.*: .* found"),
+        ("seed=2001-99-99", "seed=.*: expected .* found"),
+        ("raster.eps2d=" + "[" * 3000, r"raster\.eps2d=.*: expected .* found"),
     ],
 )
 def test_a_number_out_of_range(change: str, words: str) -> None:

@@ -115,3 +115,13 @@ def test_a_missing_video_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"expected the extra 'video' \(pip install 'bigs\[video\]'\)"):
         write_video(tmp_path / "a.mp4", [plain(RED)], 10)
+
+
+@pytest.mark.parametrize("size", [(3000, 20), (20, 3000), (12000, 2), (1, 1)])
+def test_pictures_of_any_proportions(tmp_path, size):
+    image = np.full((*size, 3), 200, dtype=np.uint8)
+    sheet = contact_sheet({"input": [image], "render": [image]}, ["frame 0"])
+    assert max(sheet.size) < 2000
+    save_picture(tmp_path / "sheet.jpg", sheet)
+    write_video(tmp_path / "strip.mp4", [np.concatenate([image] * 3, axis=1)], fps=5)
+    assert (tmp_path / "strip.mp4").stat().st_size > 0
