@@ -21,6 +21,7 @@ from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import LONGEST_M, check_solid, read_mesh
 from bigs.data.optics import Optics
+from bigs.data.tracks import check_turns
 from bigs.files import read_json
 from bigs.names import check_name
 from bigs.types import SIDES
@@ -309,6 +310,7 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     check_solid(str(folder / "mesh.obj"), verts, faces)
     file = view.raw("object")
     poses = array_field(str(file), load_npy(file), (n_rows, 7))[rows]
+    check_turns(str(file), poses[:, 1:4], valid)
     angles = poses[:, 0]
     if angles.any():
         is_top = _top_vertices(folder, len(verts))

@@ -37,7 +37,9 @@ def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: b
 def number_field(where: str, value: Any) -> float:
     """`value` as a finite number, alone or in an array; a truth value is none. Else an InputError."""
     array = _numbers(where, value)
-    if array.size != 1 or isinstance(value, bool | np.bool_):
+    dtype = value.dtype if isinstance(value, torch.Tensor) else np.asarray(value).dtype
+    is_truth_value = dtype in (torch.bool, np.dtype(bool))
+    if array.size != 1 or is_truth_value:
         raise InputError(f"{where}: expected one number, found {shown(value)}")
     check_finite(where, array.reshape(()))
     return float(array.reshape(()))
@@ -49,7 +51,9 @@ def _numbers(where: str, value: Any) -> np.ndarray:
         array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         # Rows of different lengths, and tensors that numpy does not know.
-        raise InputError(f"{where}: expected an array of numbers, found another thing ({error})") from None
+        raise InputError(
+            f"{where}: expected an array of numbers, found another thing ({shown(str(error))})"
+        ) from None
     if array.dtype.kind not in "fiub":
         raise InputError(f"{where}: expected an array of numbers, found {_kind(value, array)}")
     with np.errstate(over="ignore"):  # of wider floats, which then are infinite

@@ -20,7 +20,7 @@ from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import array_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import check_solid, read_mesh
-from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
 from bigs.files import open_regular
 from bigs.names import check_name
 from bigs.types import Side
@@ -186,7 +186,9 @@ def _read_object(
         return None
     verts, faces = read_mesh(model)
     check_solid(str(model), verts, faces)
-    rotvecs = fill_rotations(_column(files, metas, "objRot", 3, valid)[:, None], valid)[:, 0]
+    stored = _column(files, metas, "objRot", 3, valid)
+    check_turns(f"{clip.folder / 'meta'}: objRot", stored, valid)
+    rotvecs = fill_rotations(stored[:, None], valid)[:, 0]
     return ObjectTruth(
         verts=verts,
         faces=faces,

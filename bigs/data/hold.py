@@ -28,7 +28,7 @@ from bigs.data.images import (
     read_image,
 )
 from bigs.data.projection import CAMERA_TOLERANCE, decompose_projection
-from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
 from bigs.files import read_text
 from bigs.names import check_name
 from bigs.types import ENTITIES, SIDES, Side
@@ -225,6 +225,7 @@ def _read_hand(where: str, entity: Any, frames: int) -> HandTrack:
     entity = mapping_field(where, entity)
     valid = _read_valid(where, entity, frames)
     poses = _track(where, entity, "hand_poses", (frames, 48), valid)
+    check_turns(f"{where}.hand_poses", poses.reshape(frames, 16, 3), valid)
     rotvecs = fill_rotations(poses.reshape(frames, 16, 3), valid)
     return HandTrack(
         global_orient=rotvecs[:, 0],
@@ -248,8 +249,12 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
         )
     scale = _read_scale(f"{where}.obj_scale", require(f"{where}.obj_scale", entity, "obj_scale"))
     norm_mat = _entity_array(where, entity, "norm_mat", (4, 4))
-    if not np.allclose(norm_mat[3], [0, 0, 0, 1]) or abs(np.linalg.det(norm_mat[:3, :3])) < 1e-12:
-        raise InputError(f"{where}.norm_mat: expected an invertible affine matrix, found {norm_mat.tolist()}")
+    if not np.allclose(norm_mat[3], [0, 0, 0, 1]) or np.linalg.det(norm_mat[:3, :3]) < 1e-12:
+        raise InputError(
+            f"{where}.norm_mat: expected an invertible affine matrix that mirrors nothing, found "
+            f"{norm_mat.tolist()}"
+        )
+    check_turns(f"{where}.object_poses", poses[:, :3], valid)
     return ObjectTrack(
         points=points,
         colors=_read_colors(f"{where}.pts.rgb", entity["pts.rgb"], len(points))

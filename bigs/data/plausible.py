@@ -15,13 +15,11 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.meshes import LONGEST_M, SHORTEST_M
-from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
 from bigs.types import Entity, Side
 
 # Projection is singular at the camera, and 100 m away a hand is a single pixel.
 NEAREST_M, FARTHEST_M = 0.01, 100.0
-# Estimators wind an axis-angle up by a turn or two; from here on float32 loses the angle itself.
-MOST_TURN = 100.0
 # In standard deviations of MANO's shapes: nobody has 10, and at 50 no hand is left of the model.
 ODD_BETA, MOST_BETA = 10.0, 50.0
 # A box has eight corners; fewer points tell no shape, and with less than a hundred it is guessed.
@@ -66,13 +64,7 @@ def _plausible_hand(
 ) -> HandTrack:
     where = f"{clip.folder}: {side} hand"
     rotvecs = np.concatenate([track.global_orient[:, None], track.hand_pose], axis=1)
-    turns = np.linalg.norm(rotvecs, axis=-1)
-    if turns.max() > MOST_TURN:
-        t, joint = np.unravel_index(turns.argmax(), turns.shape)
-        raise InputError(
-            f"{where}: expected turns of at most {MOST_TURN:g} radians, found {turns.max():.3g} in joint "
-            f"{joint} of frame {t}"
-        )
+    check_turns(where, rotvecs, track.valid)
     beta = float(np.abs(track.betas).max())
     if beta > MOST_BETA:
         raise InputError(
@@ -192,7 +184,7 @@ def _check_shift(clip: Clip) -> None:
     if clip.object is not None:
         tracks.append(clip.object.transl)
     farthest = max(float(np.linalg.norm(_in_camera(clip, transl), axis=1).max()) for transl in tracks)
-    if length == 0.0 or _HALF_SPACE / length * (farthest + LONGEST_M + length) > _HALF_MAX:
+    if not 0.0 < length < FARTHEST_M or _HALF_SPACE / length * (farthest + LONGEST_M + length) > _HALF_MAX:
         raise InputError(
             f"{clip.folder}: normalize_shift: expected the camera's place relative to the scene, metres, "
             f"found {length:.3g} for a scene that reaches {farthest:.3g} m"

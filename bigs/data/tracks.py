@@ -5,6 +5,22 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from bigs.checks import InputError
+
+# Estimators wind an axis-angle up by a turn or two; from here on float32 loses the angle itself.
+MOST_TURN = 100.0
+
+
+def check_turns(where: str, rotvecs: np.ndarray, valid: np.ndarray) -> None:
+    """Raise `InputError` where an axis-angle [T, ..., 3] of a valid frame exceeds `MOST_TURN` radians."""
+    turns = np.linalg.norm(rotvecs, axis=-1).reshape(len(rotvecs), -1).max(axis=1)
+    wrong = np.flatnonzero(valid & (turns > MOST_TURN))
+    if wrong.size:
+        t = int(wrong[0])
+        raise InputError(
+            f"{where}: expected turns of at most {MOST_TURN:g} radians, found {turns[t]:.3g} in frame {t}"
+        )
+
 
 def fill_vectors(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Replace invalid rows by interpolating their valid neighbours; the ends repeat the nearest valid row.

@@ -160,6 +160,13 @@ CASES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "scale that is a truth value": (entity("object", "obj_scale", True), ("obj_scale", "number", "True")),
     "scale of 500 digits": (entity("object", "obj_scale", 10**500), ("obj_scale", "501 digits")),
     "scale of 5000 digits": (entity("object", "obj_scale", 10**5000), ("obj_scale", "5001 digits")),
+    "scale that is an array of one": (
+        entity("object", "obj_scale", np.array([True])),
+        ("obj_scale", "number"),
+    ),
+    "mirrored norm_mat": (entity("object", "norm_mat", np.diag([-1.0, 1, 1, 1])), ("norm_mat", "mirrors")),
+    "object turned by 1e12": (pose("object", "object_poses", 2, 1e12), ("object_poses", "turns", "frame 2")),
+    "hand turned by 1e12": (pose("left", "hand_poses", 2, 1e12), ("hand_poses", "turns", "frame 2")),
     "two scales": (entity("object", "obj_scale", np.ones(2)), ("obj_scale", "one number")),
     "ragged poses": (entity("left", "hand_poses", [[0.0], [1.0, 2.0]]), ("left.hand_poses", "numbers")),
     "poses of 1e20": (entity("left", "hand_poses", np.full((FRAMES, 48), 1e20)), ("hand_poses", "1e+20")),

@@ -112,7 +112,7 @@ def test_a_hand_that_cannot_be(checked: Callable[..., Clip], field: str, value: 
         checked(hand={field: value})
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-9])
+@pytest.mark.parametrize("length", [0.0, 1e-9, 1e9])
 def test_a_shift_that_the_challenge_cannot_hold(checked: Callable[..., Clip], length: float) -> None:
     with pytest.raises(InputError, match="normalize_shift"):
         checked(normalize_shift=np.array([0.0, 0.0, length]))

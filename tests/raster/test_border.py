@@ -207,3 +207,20 @@ def test_unpacks_as_three_values():
     colors, alphas, info = rasterization(**scene(cameras=2))
     assert colors.shape == (2, 18, 23, 3) and alphas.shape == (2, 18, 23, 1)
     assert info["n_isects"] > 0 and info["tile_size"] == 16
+
+
+def test_arrays_in_fortran_order_are_refused(monkeypatch):
+    """Their values lie at other places; the door that tensors take copies them, this one is behind it."""
+    calls = []
+    forward = _raster.rasterize_forward
+    monkeypatch.setattr(
+        rust._raster, "rasterize_forward", lambda *given: calls.append(given) or forward(*given)
+    )
+    inputs = scene(n=40)
+    rasterization(**inputs)
+    (arrays, *others) = calls[0]
+    for place, name in enumerate(("means", "quats", "scales")):
+        turned = list(arrays)
+        turned[place] = np.asfortranarray(turned[place])
+        with pytest.raises(ValueError, match=f"{name}: expected a C-contiguous array"):
+            forward(tuple(turned), *others)

@@ -8,7 +8,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-/// A borrowed array of this scalar; `TypeError` for another dtype.
+/// A borrowed array of this scalar, in C's order; `TypeError` for another dtype, `ValueError` for another order.
 pub(crate) fn slice<'py, T: Element>(
     name: &str,
     array: &Bound<'py, PyAny>,
@@ -16,6 +16,12 @@ pub(crate) fn slice<'py, T: Element>(
     let array = array
         .cast::<PyArrayDyn<T>>()
         .map_err(|_| PyTypeError::new_err(format!("{name}: expected one floating dtype for all arrays")))?;
+    // A slice can be had of Fortran's order, too: the same values at other places.
+    if !array.is_c_contiguous() {
+        return Err(PyValueError::new_err(format!(
+            "{name}: expected a C-contiguous array"
+        )));
+    }
     Ok(array.readonly())
 }
 
