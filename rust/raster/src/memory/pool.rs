@@ -110,8 +110,9 @@ pub(crate) fn bytes_of<U>(buffer: &Vec<U>) -> usize {
 
 /// A buffer of `len` elements whose old contents may still be there: for one that is overwritten whole.
 pub(crate) fn stale<U: Copy + Default>(buffer: &mut Vec<U>, len: usize) -> &mut [U] {
-    if buffer.len() < len {
-        // Cleared first, so that growing copies nothing.
+    if buffer.capacity() < len {
+        // Cleared first, so that growing copies nothing. Within the capacity only what is new is written: the counts of
+        // a fit rise a little with every call.
         buffer.clear();
     }
     buffer.resize(len, U::default());
