@@ -7,11 +7,14 @@ use rayon::prelude::*;
 use crate::composite::dispatch;
 use crate::composite::forward::{Canvas, LEAST_ALPHA, cut};
 use crate::composite::intersection_gradients::{IntersectionGradients, gradient_size};
-use crate::composite::kernel::{BLOCK, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane};
+use crate::composite::kernel::{
+    BLOCK, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane,
+};
 use crate::composite::scene::Scene;
 use crate::math::real::Real;
 use crate::memory::pool::Pooled;
 use crate::simd::Vectors;
+use crate::simd::level::{Simd, Work};
 
 /// Gradients of an image.
 #[derive(Clone, Copy)]
@@ -70,7 +73,14 @@ pub(crate) fn composite_vjp<T: Vectors>(
                 let transmittance = &canvas.transmittance[own.clone()];
                 let mut skipped = true;
                 while task.first < total {
-                    let any = incoming.load(scene, canvas, tile, task.first, v);
+                    let any = level.run(Load {
+                        incoming,
+                        scene,
+                        canvas,
+                        tile,
+                        first: task.first,
+                        v,
+                    });
                     if scene.background.is_some() {
                         for k in 0..(total - task.first).min(MAX_CHANNELS) {
                             v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
@@ -121,12 +131,35 @@ fn clear<T: Real>(gradients: &mut [T], size: usize, first: usize, total: usize) 
     }
 }
 
+/// Lane by lane, then over the lanes.
 fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
-    let products = a
-        .iter()
-        .zip(b)
-        .flat_map(|(a, b)| a.0.iter().zip(&b.0).map(|(&a, &b)| a * b));
-    products.sum()
+    let mut sums = [T::ZERO; LANES];
+    for (a, b) in a.iter().zip(b) {
+        for i in 0..LANES {
+            sums[i] += a.0[i] * b.0[i];
+        }
+    }
+    sums.into_iter().sum()
+}
+
+/// [`TileGradients::load`].
+struct Load<'a, T> {
+    incoming: &'a mut TileGradients<T>,
+    scene: &'a Scene<'a, T>,
+    canvas: &'a Canvas<T>,
+    tile: usize,
+    first: usize,
+    v: Cotangents<'a, T>,
+}
+
+impl<T: Real> Work for Load<'_, T> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) -> bool {
+        self.incoming
+            .load(self.scene, self.canvas, self.tile, self.first, self.v)
+    }
 }
 
 /// The incoming gradients of one tile, for one group of channels.
@@ -144,6 +177,7 @@ impl<T: Real> TileGradients<T> {
     }
 
     /// Reads the channels from `first` on; whether any gradient is not zero.
+    #[inline(always)]
     fn load(
         &mut self,
         scene: &Scene<'_, T>,
@@ -156,16 +190,19 @@ impl<T: Real> TileGradients<T> {
         let whole = scene.pixel_mask.is_none()
             && scene.grid.origin(tile).0 + scene.grid.tile_size <= scene.grid.width
             && scene.grid.origin(tile).1 + scene.grid.tile_size <= scene.grid.height;
-        if whole && !scene.expected_depth && scene.background.is_none() && first == 0 {
-            match total {
-                1 => return self.load_whole::<1>(scene, tile, v),
-                3 => return self.load_whole::<3>(scene, tile, v),
-                4 => return self.load_whole::<4>(scene, tile, v),
+        let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
+        if whole && !scene.expected_depth && first == 0 {
+            match (total, scene.background.is_some()) {
+                (1, false) => return self.load_whole::<1, false>(scene, tile, v, &background),
+                (3, false) => return self.load_whole::<3, false>(scene, tile, v, &background),
+                (4, false) => return self.load_whole::<4, false>(scene, tile, v, &background),
+                (1, true) => return self.load_whole::<1, true>(scene, tile, v, &background),
+                (3, true) => return self.load_whole::<3, true>(scene, tile, v, &background),
+                (4, true) => return self.load_whole::<4, true>(scene, tile, v, &background),
                 _ => {}
             }
         }
         let used = (total - first).min(MAX_CHANNELS);
-        let background: [T; MAX_CHANNELS] = std::array::from_fn(|k| scene.background(first + k));
         *self = Self::new();
         let mut any = false;
         let least = T::of(LEAST_ALPHA);
@@ -200,12 +237,14 @@ impl<T: Real> TileGradients<T> {
         any
     }
 
-    /// A tile within the image, all of whose K channels are colours over black or plain depth.
-    fn load_whole<const K: usize>(
+    /// A tile within the image, all of whose K channels are colours or plain depth.
+    #[inline(always)]
+    fn load_whole<const K: usize, const BACKGROUND: bool>(
         &mut self,
         scene: &Scene<'_, T>,
         tile: usize,
         v: Cotangents<'_, T>,
+        background: &[T; MAX_CHANNELS],
     ) -> bool {
         let mut any = false;
         let colors = v.colors.as_chunks::<K>().0;
@@ -216,13 +255,20 @@ impl<T: Real> TileGradients<T> {
             ) else {
                 return;
             };
+            let mut v_transmittance = [T::ZERO; BLOCK];
             for k in 0..K {
                 let values = std::array::from_fn(|i| colors[i][k]);
                 any |= values != [T::ZERO; BLOCK];
                 self.v_values[k][block].rows_mut()[lane / BLOCK] = values;
+                if BACKGROUND {
+                    for i in 0..BLOCK {
+                        v_transmittance[i] += values[i] * background[k];
+                    }
+                }
             }
             any |= *alphas != [T::ZERO; BLOCK];
-            self.v_transmittance[block].rows_mut()[lane / BLOCK] = std::array::from_fn(|i| -alphas[i]);
+            self.v_transmittance[block].rows_mut()[lane / BLOCK] =
+                std::array::from_fn(|i| v_transmittance[i] + -alphas[i]);
         });
         any
     }

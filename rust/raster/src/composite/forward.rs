@@ -10,6 +10,7 @@ use crate::composite::scene::Scene;
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, Pooled, bytes_of, stale};
 use crate::simd::Vectors;
+use crate::simd::level::{Simd, Work};
 
 /// Expected depth divides by alpha, or by this where there is hardly any; gsplat's constant.
 pub(crate) const LEAST_ALPHA: f64 = 1e-10;
@@ -158,7 +159,7 @@ fn composite_tile<T: Vectors>(
     scene: &Scene<'_, T>,
     background: &[T],
     planes: &mut [Lanes<T>],
-    mut out: Strip<'_, T>,
+    out: Strip<'_, T>,
 ) -> usize {
     let mut saturated = 0;
     let level = scene.limits.level;
@@ -190,16 +191,45 @@ fn composite_tile<T: Vectors>(
         out.depths
             .copy_from_slice(&planes[(total - 1) * blocks..total * blocks]);
     }
-    match total {
-        1 if !scene.expected_depth => write_colors::<T, 1>(scene, background, planes, &mut out),
-        3 if !scene.expected_depth => write_colors::<T, 3>(scene, background, planes, &mut out),
-        4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
-        _ => write_tile(scene, background, planes, &mut out),
-    }
+    level.run(WriteTile {
+        scene,
+        background,
+        planes,
+        out,
+    });
     saturated
 }
 
+/// [`write_tile`], or [`write_colors`] where that will do.
+struct WriteTile<'a, T> {
+    scene: &'a Scene<'a, T>,
+    background: &'a [T],
+    planes: &'a [Lanes<T>],
+    out: Strip<'a, T>,
+}
+
+impl<T: Real> Work for WriteTile<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self {
+            scene,
+            background,
+            planes,
+            mut out,
+        } = self;
+        match scene.channels.total {
+            1 if !scene.expected_depth => write_colors::<T, 1>(scene, background, planes, &mut out),
+            3 if !scene.expected_depth => write_colors::<T, 3>(scene, background, planes, &mut out),
+            4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
+            _ => write_tile(scene, background, planes, &mut out),
+        }
+    }
+}
+
 /// Writes a tile into its rows of the image: adds the background, divides expected depth by alpha.
+#[inline(always)]
 fn write_tile<T: Real>(scene: &Scene<'_, T>, background: &[T], planes: &[Lanes<T>], out: &mut Strip<'_, T>) {
     let total = scene.channels.total;
     let (blocks, side) = (scene.blocks(), scene.grid.tile_size / BLOCK);
@@ -220,6 +250,7 @@ fn write_tile<T: Real>(scene: &Scene<'_, T>, background: &[T], planes: &[Lanes<T
 }
 
 /// [`write_tile`] for the usual numbers of channels and no division, a row of a block at a time.
+#[inline(always)]
 fn write_colors<T: Real, const K: usize>(
     scene: &Scene<'_, T>,
     background: &[T],
