@@ -56,17 +56,17 @@ impl<T: Real> Buffers for ListScratch<T> {
 
 /// Puts the Gaussians that reach some tile in order of depth, ties by index.
 fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut ListScratch<T>) {
-    scratch.order.clear();
+    let order = stale(&mut scratch.order, splats.len());
+    let mut reached = 0;
     for (packet, (splats, cover)) in splats.chunks(PACKET_SIZE).zip(covers).enumerate() {
         let first = (packet * PACKET_SIZE) as u32;
-        let reached = splats
-            .iter()
-            .enumerate()
-            .filter(|&(local, _)| cover.reaches(local));
-        scratch
-            .order
-            .extend(reached.map(|(local, splat)| (splat.depth.key(), first + local as u32)));
+        for (local, splat) in splats.iter().enumerate() {
+            // Overwritten by the next if it reaches nothing, which is hard for a branch to predict.
+            order[reached] = (splat.depth.key(), first + local as u32);
+            reached += usize::from(cover.reaches(local));
+        }
     }
+    scratch.order.truncate(reached);
     radix_sort_with(&mut scratch.order, &mut scratch.sort);
 }
 
@@ -121,6 +121,12 @@ struct Lists<'a> {
 }
 
 impl Lists<'_> {
+    /// Starts to bring the tiles of a Gaussian into the first cache.
+    #[inline(always)]
+    fn prefetch(&self, i: u32) {
+        self.covers[i as usize / PACKET_SIZE].prefetch(i as usize % PACKET_SIZE);
+    }
+
     /// Puts a Gaussian into the list of each tile that it reaches, where `place` says.
     #[inline(always)]
     fn put(&self, i: u32, mut place: impl FnMut(u32) -> u32) {
@@ -132,6 +138,9 @@ impl Lists<'_> {
         }
     }
 }
+
+/// Gaussians whose tiles are asked for ahead of the one being listed: in order of depth they lie anywhere.
+const AHEAD: usize = 8;
 
 /// Lists the splats of every tile, after [`sort_by_depth`] and [`count_by_tile`]: the near half from the front of each
 /// list, at the same time the far half from its back.
@@ -151,7 +160,10 @@ fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &m
     let (near, far) = order.split_at(order.len() / 2);
     rayon::join(
         || {
-            for &(_, i) in near {
+            for (k, &(_, i)) in near.iter().enumerate() {
+                if let Some(&(_, soon)) = near.get(k + AHEAD) {
+                    out.prefetch(soon);
+                }
                 out.put(i, |tile| {
                     let next = &mut fronts[tile as usize];
                     *next += 1;
@@ -160,7 +172,10 @@ fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &m
             }
         },
         || {
-            for &(_, i) in far.iter().rev() {
+            for (k, &(_, i)) in far.iter().enumerate().rev() {
+                if let Some(&(_, soon)) = k.checked_sub(AHEAD).and_then(|k| far.get(k)) {
+                    out.prefetch(soon);
+                }
                 out.put(i, |tile| {
                     let last = &mut backs[tile as usize];
                     *last -= 1;

@@ -2,6 +2,7 @@
 
 use crate::math::real::Real;
 use crate::memory::pool::{bytes_of, filled};
+use crate::simd::prefetch;
 
 /// How an image is cut into square tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -261,6 +262,12 @@ impl Cover {
     #[inline(always)]
     pub(crate) fn reaches(&self, local: usize) -> bool {
         self.begins[local] < self.begins[local + 1]
+    }
+
+    /// Starts to bring the tiles of a Gaussian into the first cache.
+    #[inline(always)]
+    pub(crate) fn prefetch(&self, local: usize) {
+        prefetch(&self.tiles, self.begins[local] as usize);
     }
 
     pub(crate) fn tiles_of(&self, local: usize) -> &[u32] {
