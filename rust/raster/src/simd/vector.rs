@@ -48,6 +48,11 @@ pub trait Vector: Copy {
 
     /// self ≥ other
     fn at_least(self, other: Self) -> Self::Mask;
+    /// self ≥ other where the mask holds.
+    #[inline(always)]
+    fn at_least_where(self, other: Self, mask: Self::Mask) -> Self::Mask {
+        Self::both(mask, self.at_least(other))
+    }
     /// self > other
     fn above(self, other: Self) -> Self::Mask;
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;

@@ -62,13 +62,11 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         let level = rules.one.level();
         let (u, v) = entry.whitened(block.x.get::<V>(level, lane), block.y.get(level, lane));
         let raw = entry.raw_alpha::<V, DEGREE>(u, v);
-        let hit = V::both(
-            block
-                .end
-                .get::<V>(level, lane)
-                .at_least(V::splat(level, entry.place)),
-            raw.at_least(rules.threshold),
-        );
+        let lit = block
+            .end
+            .get::<V>(level, lane)
+            .at_least(V::splat(level, entry.place));
+        let hit = raw.at_least_where(rules.threshold, lit);
         let alpha = raw.min(rules.max_alpha).keep(hit);
         let before = block
             .transmittance
@@ -82,8 +80,10 @@ impl<V: Vector, const K: usize> Sums<V, K> {
         for k in 1..K {
             change = V::splat(level, entry.values[k]).times_plus(block.v_values[k].get(level, lane), change);
         }
-        let free = V::both(hit, rules.max_alpha.at_least(raw));
-        let h = before.times(change).times(raw).keep(free);
+        // Where alpha is not limited it is raw.
+        let h = weight
+            .times(change)
+            .keep(rules.max_alpha.at_least_where(raw, hit));
         block.transmittance.set(lane, before);
         block.behind.set(lane, alpha.times_plus(change, behind));
         let (hu, hv) = (h.times(u), h.times(v));

@@ -6,11 +6,15 @@ use crate::simd::vector::{EXP2_F32_FLOOR, EXP2_F64, MAX_SUMS, Vector, exp2_f32, 
 
 /// Comparisons of 512-bit vectors: a mask is a mask register.
 macro_rules! masks512 {
-    ($Mask:ty, $cmp:ident, $mov:ident, $maskz_mov:ident) => {
+    ($Mask:ty, $cmp:ident, $mask_cmp:ident, $mov:ident, $maskz_mov:ident) => {
         type Mask = $Mask;
         #[inline(always)]
         fn at_least(self, other: Self) -> $Mask {
             op!($cmp::<_CMP_GE_OQ>(self.0, other.0))
+        }
+        #[inline(always)]
+        fn at_least_where(self, other: Self, mask: $Mask) -> $Mask {
+            op!($mask_cmp::<_CMP_GE_OQ>(mask, self.0, other.0))
         }
         #[inline(always)]
         fn above(self, other: Self) -> $Mask {
@@ -97,13 +101,8 @@ impl Vector for F32x16 {
         _mm512_min_ps,
         _mm512_max_ps
     );
-    #[inline(always)]
-    fn over(self, other: Self) -> Self {
-        // A quotient from a reciprocal of 14 bits, corrected once by its remainder: the division unit takes twice as long.
-        let reciprocal = Self(op!(_mm512_rcp14_ps(other.0)));
-        let quotient = self.times(reciprocal);
-        quotient.times_from(other, self).times_plus(reciprocal, quotient)
-    }
+    // A corrected reciprocal takes three instructions more, and the backward pass is short of units to run them on.
+    divided!(_mm512_div_ps);
     fused!(
         _mm512_fmadd_ps,
         _mm512_fmsub_ps,
@@ -113,6 +112,7 @@ impl Vector for F32x16 {
     masks512!(
         __mmask16,
         _mm512_cmp_ps_mask,
+        _mm512_mask_cmp_ps_mask,
         _mm512_mask_mov_ps,
         _mm512_maskz_mov_ps
     );
@@ -176,6 +176,7 @@ impl Vector for F64x8 {
     masks512!(
         __mmask8,
         _mm512_cmp_pd_mask,
+        _mm512_mask_cmp_pd_mask,
         _mm512_mask_mov_pd,
         _mm512_maskz_mov_pd
     );
