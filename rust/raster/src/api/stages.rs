@@ -187,7 +187,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
                 let splat = &self.projected.splats[gaussian as usize];
                 let dx = column as f64 + 0.5 - splat.x.as_f64();
                 let dy = row as f64 + 0.5 - splat.y.as_f64();
-                let u = splat.w11.as_f64() * dx + splat.w12.as_f64() * dy;
+                let u = splat.w11.as_f64() * dx + splat.w12().as_f64() * dy;
                 let v = splat.w22.as_f64() * dy;
                 let alpha = (splat.log_opacity.as_f64() - (u * u + v * v)).exp2().min(most);
                 if alpha < threshold {

@@ -140,7 +140,7 @@ pub(crate) fn sum_packet<T: Real>(
         }
         if let Some(v) = out.means2d.get_mut(local) {
             *v = kept(
-                [gain * splat.w11 * hu, gain * (splat.w12 * hu + splat.w22 * hv)],
+                [gain * splat.w11 * hu, gain * (splat.w12() * hu + splat.w22 * hv)],
                 [hu, hv],
             );
             if out.detach_means2d {

@@ -84,8 +84,8 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
         columns.set(lane, gaussians, first + lane);
     }
     let zero = [T::ZERO; PACKET_SIZE];
-    let [mut xs, mut ys, mut depths, mut log_opacities, mut reaches] = [zero; 5];
-    let [mut w11s, mut w12s, mut w22s, mut rxs, mut rys] = [zero; 5];
+    let [mut xs, mut ys, mut depths, mut log_opacities] = [zero; 4];
+    let [mut w11s, mut w22s, mut tilts, mut rxs, mut rys] = [zero; 5];
     let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
     let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; PACKET_SIZE]; 5];
     let (height, most) = (T::of(grid.height as f64), T::of(MOST_EXACT));
@@ -96,20 +96,19 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
         let o = splat::<T, ANTIALIASED>(&projection, mean, quat, scale, opacity);
         let s = &o.splat;
         (xs[lane], ys[lane], depths[lane]) = (s.x, s.y, s.depth);
-        (w11s[lane], w12s[lane], w22s[lane]) = (s.w11, s.w12, s.w22);
-        (log_opacities[lane], reaches[lane]) = (s.log_opacity, s.reach);
+        (w11s[lane], w22s[lane]) = (s.w11, s.w22);
+        (slopes[lane], tilts[lane], log_opacities[lane]) = (s.slope, s.tilt, s.log_opacity);
         [rxs[lane], rys[lane]] = o.radii;
         ceil_xs[lane] = o.radii[0].lesser(most).ceiling();
         ceil_ys[lane] = o.radii[1].lesser(most).ceiling();
         seen[lane] = u32::from(o.visible);
 
-        let reach = padded_reach(s.reach);
+        let reach = padded_reach(o.reach);
         let extent = extent(reach);
         let (half_width, half_height) = (extent * o.deviations[0], extent * o.deviations[1]);
         padded[lane] = reach;
         inverses[lane] = T::ONE / s.w11;
-        slopes[lane] = o.slope;
-        rights[lane] = o.tilt * half_width;
+        rights[lane] = s.tilt * half_width;
         half_heights[lane] = half_height;
         let (top, past) = pixel_range(s.y - half_height, s.y + half_height, height);
         let any = o.visible & (top < past);
@@ -140,10 +139,10 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
             x,
             y,
             w11: w11s[lane],
-            w12: w12s[lane],
             w22: w22s[lane],
+            slope: slopes[lane],
+            tilt: tilts[lane],
             log_opacity: log_opacities[lane],
-            reach: reaches[lane],
             depth,
         };
         means2d[lane] = [x, y];
@@ -239,6 +238,19 @@ fn add<T: Real, const N: usize>(locals: &[u32], columns: [&Column<T>; N], sums: 
     }
 }
 
+/// The sum of the first `len` values: lane by lane, then over the lanes, in the same order whatever the CPU's vectors.
+#[inline(always)]
+fn sum_of_lanes<T: Real>(column: &mut Column<T>, len: usize) -> T {
+    column[len..whole_vectors(len)].fill(T::ZERO);
+    let mut sums = [T::ZERO; LANES];
+    for values in column[..whole_vectors(len)].as_chunks::<LANES>().0 {
+        for i in 0..LANES {
+            sums[i] += values[i];
+        }
+    }
+    sums.into_iter().sum()
+}
+
 /// Whether all are finite: NaN and infinity survive a multiplication by 0.
 #[inline(always)]
 pub(crate) fn is_sound<T: Real, const N: usize>(values: [T; N]) -> bool {
@@ -295,8 +307,8 @@ pub(crate) fn packet_vjp<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
         }
     }
     if CAMERA {
-        for (sum, column) in packet.viewmat.as_flattened_mut().iter_mut().zip(&viewmats) {
-            *sum = column[..len].iter().copied().sum();
+        for (sum, column) in packet.viewmat.as_flattened_mut().iter_mut().zip(&mut viewmats) {
+            *sum = sum_of_lanes(column, len);
         }
     }
 }

@@ -28,14 +28,22 @@ pub(crate) struct Splat<T> {
     pub(crate) x: T,
     pub(crate) y: T,
     pub(crate) w11: T,
-    pub(crate) w12: T,
     pub(crate) w22: T,
+    /// As in [`crate::math::covariance::Whitening`].
+    pub(crate) slope: T,
+    pub(crate) tilt: T,
     /// log₂ of the opacity after compensation, or of [`FAINTEST`].
     pub(crate) log_opacity: T,
-    /// Alpha reaches the threshold where u² + v² ≤ `reach`.
-    pub(crate) reach: T,
     /// Camera z.
     pub(crate) depth: T,
+}
+
+impl<T: Real> Splat<T> {
+    /// See [`crate::math::covariance::Whitening`]: the very bits of its `w12`.
+    #[inline(always)]
+    pub(crate) fn w12(&self) -> T {
+        -self.w11 * self.slope
+    }
 }
 
 /// What the caller learns about every Gaussian; zeros for those that no pixel sees.
@@ -55,7 +63,6 @@ pub(crate) struct Projection<T> {
     /// Least and greatest slope for the Jacobian, along x and y.
     slopes: [(T, T); 2],
     size: [T; 2],
-    /// log₂ of the alpha threshold.
     log_threshold: T,
 }
 
@@ -71,12 +78,21 @@ impl<T: Real> Projection<T> {
             perspective: camera.model == CameraModel::Pinhole,
             slopes: [slopes(k.fx, k.cx, size[0]), slopes(k.fy, k.cy, size[1])],
             size,
-            log_threshold: limits.alpha_threshold.greater(T::TINY).log2(),
+            log_threshold: log_threshold(limits),
         }
     }
 
     pub(crate) fn antialiased(&self) -> bool {
         self.limits.antialiased
+    }
+}
+
+/// log₂ of the alpha threshold, −∞ without one: a splat reaches as far as log₂ of its opacity exceeds it.
+pub(crate) fn log_threshold<T: Real>(limits: &Limits<T>) -> T {
+    if limits.alpha_threshold > T::ZERO {
+        limits.alpha_threshold.greater(T::TINY).log2()
+    } else {
+        T::of(f64::NEG_INFINITY)
     }
 }
 
@@ -150,16 +166,14 @@ fn footprint<T: Real>(
     }
 }
 
-/// A splat and its outline: the ellipse {u² + v² ≤ reach}.
+/// A splat and its outline: the ellipse {u² + v² ≤ reach}, where alpha reaches the threshold.
 pub(crate) struct Outlined<T> {
     pub(crate) splat: Splat<T>,
+    pub(crate) reach: T,
     /// Half the extent along x and y, in px.
     pub(crate) radii: [T; 2],
     /// Standard deviations along x and y, in px.
     pub(crate) deviations: [T; 2],
-    /// As in [`crate::math::covariance::Whitening`].
-    pub(crate) slope: T,
-    pub(crate) tilt: T,
     /// Whether some pixel may see it; if not, the other fields are of no meaning.
     pub(crate) visible: bool,
 }
@@ -192,11 +206,7 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
         opacity
     };
     let log_opacity = opacity.greater(T::of(FAINTEST)).log2();
-    let reach = if limits.alpha_threshold > T::ZERO {
-        log_opacity - projection.log_threshold
-    } else {
-        T::of(f64::INFINITY)
-    };
+    let reach = log_opacity - projection.log_threshold;
     let extent = extent(reach);
     let (rx, ry) = (extent * w.deviations[0], extent * w.deviations[1]);
     // Finite inputs can overflow to NaN here; these comparisons are false for it, so that it is culled.
@@ -212,16 +222,15 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
             x,
             y,
             w11: w.w11,
-            w12: w.w12,
             w22: w.w22,
+            slope: w.slope,
+            tilt: w.tilt,
             log_opacity,
-            reach,
             depth,
         },
+        reach,
         radii: [rx, ry],
         deviations: w.deviations,
-        slope: w.slope,
-        tilt: w.tilt,
         visible: in_range & on_screen & !clipped & (opacity >= limits.alpha_threshold),
     }
 }

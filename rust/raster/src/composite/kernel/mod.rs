@@ -207,10 +207,11 @@ impl<T: Real, const K: usize> Entry<T, K> {
                 }
             }
         }
+        let w12 = splat.w12();
         Self {
             w11: splat.w11,
-            w12: splat.w12,
-            u0: -(splat.w11 * x + splat.w12 * y),
+            w12,
+            u0: -(splat.w11 * x + w12 * y),
             w22: splat.w22,
             v0: -(splat.w22 * y),
             log_opacity: splat.log_opacity,

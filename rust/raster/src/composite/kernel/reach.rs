@@ -2,7 +2,7 @@
 
 use super::{BLOCK, LANES, Lanes, TileTask};
 use crate::math::real::Real;
-use crate::project::splat::Splat;
+use crate::project::splat::{Splat, log_threshold};
 use crate::project::tiles::padded_reach;
 use crate::simd::vector::Vector;
 
@@ -10,6 +10,7 @@ use crate::simd::vector::Vector;
 pub(super) struct BlockCentres<T> {
     x: Lanes<T>,
     y: Lanes<T>,
+    log_threshold: T,
     /// The blocks that exist.
     mask: u16,
 }
@@ -22,6 +23,7 @@ impl<T: Real> BlockCentres<T> {
         Self {
             x: Lanes(std::array::from_fn(|b| x + offset(b % side))),
             y: Lanes(std::array::from_fn(|b| y + offset(b / side))),
+            log_threshold: log_threshold(task.limits),
             mask: ((1u32 << (side * side)) - 1) as u16,
         }
     }
@@ -39,14 +41,12 @@ impl<T: Real> BlockCentres<T> {
     ) -> u16 {
         let (w11, w12, w22) = (
             V::splat(level, splat.w11),
-            V::splat(level, splat.w12),
+            V::splat(level, splat.w12()),
             V::splat(level, splat.w22),
         );
-        let reach = V::splat(level, padded_reach(splat.reach));
-        // On a vertical line the form is least at dy = −(w11 w12 / (w12² + w22²)) dx, on a horizontal one at
-        // dx = −(w12 / w11) dy.
-        let down = -(splat.w11 * splat.w12) / (splat.w12 * splat.w12 + splat.w22 * splat.w22);
-        let (down, across) = (V::splat(level, down), V::splat(level, -splat.w12 / splat.w11));
+        let reach = V::splat(level, padded_reach(splat.log_opacity - self.log_threshold));
+        // On a vertical line the form is least at dy = tilt · dx, on a horizontal one at dx = slope · dy.
+        let (tilt, slope) = (V::splat(level, splat.tilt), V::splat(level, splat.slope));
         let (x, y) = (V::splat(level, x), V::splat(level, y));
         let (span, zero) = (
             V::splat(level, T::of(BLOCK as f64 - 1.0)),
@@ -59,8 +59,8 @@ impl<T: Real> BlockCentres<T> {
             let (right, bottom) = (left.plus(span), top.plus(span));
             let near_x = left.max(right.min(zero));
             let near_y = top.max(bottom.min(zero));
-            let y_on_edge = down.times(near_x).min(bottom).max(top);
-            let x_on_edge = across.times(near_y).min(right).max(left);
+            let y_on_edge = tilt.times(near_x).min(bottom).max(top);
+            let x_on_edge = slope.times(near_y).min(right).max(left);
             let u1 = w11.times_plus(near_x, w12.times(y_on_edge));
             let v1 = w22.times(y_on_edge);
             let u2 = w11.times_plus(x_on_edge, w12.times(near_y));

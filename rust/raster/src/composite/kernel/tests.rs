@@ -46,18 +46,18 @@ fn run_with<T: Vectors>(runner: Runner, channels: usize, side: usize, settings: 
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         (state >> 40) as f64 / (1u64 << 24) as f64
     };
-    let threshold = 1.0 / 255.0;
     let splats: Vec<Splat<T>> = (0..SPLATS)
         .map(|i| {
             let opacity = if i % 2 == 0 { 0.06 } else { 1.02 * uniform() + 0.01 };
+            let (w11, w12, w22) = (0.1 + 0.5 * uniform(), uniform() - 0.5, 0.1 + 0.5 * uniform());
             Splat {
                 x: T::of(64.0 + 20.0 * uniform() - 2.0),
                 y: T::of(32.0 + 20.0 * uniform() - 2.0),
-                w11: T::of(0.1 + 0.5 * uniform()),
-                w12: T::of(uniform() - 0.5),
-                w22: T::of(0.1 + 0.5 * uniform()),
+                w11: T::of(w11),
+                w22: T::of(w22),
+                slope: T::of(-w12 / w11),
+                tilt: T::of(-w11 * w12 / (w12 * w12 + w22 * w22)),
                 log_opacity: T::of(opacity.log2()),
-                reach: T::of((opacity / threshold).log2()),
                 depth: T::of(1.0 + i as f64),
             }
         })
