@@ -1,6 +1,8 @@
 """What a pickle asks for, as inert records: its program is run, but no call in it does anything.
 
-Every name is checked against a short list, and even a name on the list is not what gets called.
+Every name is checked against a short list, and even a name on the list is not what gets called. Before it is
+run, its operations are counted, and how much there would be to hash: parts that are shared level by level
+make a key of 2^n parts out of n operations.
 `bigs.unpickle` turns the records into values.
 """
 
@@ -10,11 +12,23 @@ import io
 import pickle
 import pickletools
 import re
-from typing import Any, BinaryIO
+from collections.abc import Sequence
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 Global = tuple[str, str]
+
+# A clip of 2000 frames takes 80 000 operations, MANO's own file 300.
+MAX_OPERATIONS = 500_000
+# Values in a part when everything shared is written out, and values that are hashed as keys in all.
+MAX_VALUES = 1_000_000
+# Data sets nest five levels deep; hashing and printing use the stack of the machine for each level.
+MAX_DEPTH = 50
+# No data set has longer integers, and such keys can be made to collide; a field may hold a wrong one.
+_LONG_INTEGER, _MAX_LONG_INTEGERS = 1 << 64, 1000
+# Arguments of what may be called; a tensor has seven.
+_MAX_ARGUMENTS = 16
 
 # The names a pickle may use, as canonical (module, qualified name) pairs; see `_canonical`.
 CONTAINERS: frozenset[Global] = frozenset(
@@ -74,6 +88,8 @@ class Record:
     state: Any
 
     def __new__(cls, *args: Any) -> Record:
+        if len(args) > _MAX_ARGUMENTS:
+            raise ValueError(f"{cls.__name__} of {len(args)} arguments")
         record = object.__new__(cls)
         record.args = args
         record.state = None
@@ -126,14 +142,110 @@ class _RecordingUnpickler(pickle.Unpickler):
         return PersistentId(pid)
 
 
+class _Part(NamedTuple):
+    """Of a value on the stack what hashing it takes."""
+
+    values: int = 1  # with everything shared written out
+    depth: int = 0
+
+
+_PLAIN = _Part()
+_GETS, _PUTS = ("GET", "BINGET", "LONG_BINGET"), ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE")
+_TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "FROZENSET")
+
+
+class _Rehearsal:
+    """A walk over a program before it is run, with counts in the place of values.
+
+    Tuples and frozen sets are the only values that are hashed with what they hold, and they never change, so
+    that what is counted when one is made stays true.
+    """
+
+    def __init__(self) -> None:
+        self._stack: list[_Part | None] = []  # None is a mark
+        self._memo: dict[int, _Part] = {}
+        self._hashed = 0
+        self._long_integers = 0
+
+    def follow(self, stream: io.BytesIO) -> None:
+        """Raise ValueError at what takes more than it may.
+
+        A length beyond the end of the data, for which the unpickler would allocate gigabytes, is noticed by
+        the walk itself.
+        """
+        for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+            if count >= MAX_OPERATIONS:
+                raise ValueError(f"more than {MAX_OPERATIONS} operations")
+            if type(argument) is int and abs(argument) >= _LONG_INTEGER:
+                self._long_integers += 1
+                if self._long_integers > _MAX_LONG_INTEGERS:
+                    raise ValueError(f"more than {_MAX_LONG_INTEGERS} integers beyond 64 bits")
+            try:
+                self._take(opcode, argument, count)
+            except IndexError:
+                raise ValueError(f"{opcode.name} without what it needs") from None
+
+    def _take(self, opcode: pickletools.OpcodeInfo, argument: Any, count: int) -> None:
+        name, stack = opcode.name, self._stack
+        if name == "MARK":
+            stack.append(None)
+        elif name == "POP":
+            stack.pop()
+        elif name == "DUP":
+            stack.append(stack[-1])
+        elif name in _GETS:
+            stack.append(self._memo.get(int(argument), _PLAIN))
+        elif name in _PUTS:
+            slot = len(self._memo) if argument is None else int(argument)
+            # The unpickler's memo is as long as its highest slot.
+            if slot > count:
+                raise ValueError(f"memo slot {slot} after {count} instructions")
+            self._memo[slot] = stack[-1] or _PLAIN
+        else:
+            parts = self._popped(opcode)
+            if name in ("DICT", "SETITEMS"):
+                self._hash(parts[::2])
+            elif name == "SETITEM":
+                self._hash(parts[1:2])
+            elif name in ("ADDITEMS", "FROZENSET"):
+                self._hash(parts)
+            if name in _TUPLES:
+                stack.append(_whole(parts))
+            else:
+                stack += [_PLAIN] * len(opcode.stack_after)
+
+    def _popped(self, opcode: pickletools.OpcodeInfo) -> list[_Part]:
+        """What an operation takes off the stack: down to the last mark, or so many values."""
+        stack, before = self._stack, opcode.stack_before
+        if pickletools.markobject not in before:
+            parts = [stack.pop() or _PLAIN for _ in before]
+            return parts[::-1]
+        parts = []
+        while (part := stack.pop()) is not None:
+            parts.append(part)
+        for _ in range(before.index(pickletools.markobject)):
+            stack.pop()
+        return parts[::-1]
+
+    def _hash(self, keys: Sequence[_Part]) -> None:
+        self._hashed += sum(key.values for key in keys)
+        if self._hashed > MAX_VALUES:
+            raise ValueError(f"keys of more than {MAX_VALUES} values")
+
+
+def _whole(parts: Sequence[_Part]) -> _Part:
+    values, depth = 1 + sum(part.values for part in parts), 1 + max((part.depth for part in parts), default=0)
+    if values > MAX_VALUES:
+        raise ValueError(f"a tuple of more than {MAX_VALUES} values")
+    if depth > MAX_DEPTH:
+        raise ValueError(f"tuples nested more than {MAX_DEPTH} levels deep")
+    return _Part(values, depth)
+
+
 def load_records(stream: io.BytesIO, allow: frozenset[Global], *, persistent: bool = False) -> Any:
     """The next pickle in `stream` with every global call left as a record."""
     start = stream.tell()
-    # A few forged bytes can make the unpickler allocate gigabytes: a length beyond the end of the data (which
-    # this walk over the program notices by itself), or a memo slot that no program of this size would reach.
-    for count, (opcode, argument, _position) in enumerate(pickletools.genops(stream)):
-        if opcode.name.endswith("PUT") and int(argument or 0) > count:
-            raise ValueError(f"memo slot {argument} after {count} instructions")
+    _Rehearsal().follow(stream)
     stream.seek(start)
     return _RecordingUnpickler(stream, allow, persistent=persistent).load()
 

@@ -2,7 +2,8 @@
 
 A pickle is a program that may name any function. `bigs.pickle_records` runs it with every call replaced by an
 inert record of what was asked for. Here the records become arrays, sparse matrices and tensors, by code that
-checks types, sizes and indices. (Handing a pickle the real `numpy.dtype` is not safe: a forged dtype state
+checks types, sizes and indices, and counts what it makes: a kilobyte can share its parts level by level, or
+announce a matrix of terabytes. (Handing a pickle the real `numpy.dtype` is not safe: a forged dtype state
 lets raw bytes pass for object pointers.)
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,11 +21,13 @@ import scipy.sparse
 import torch
 
 from bigs.archives import npy_header, read_array
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 from bigs.files import open_regular
 from bigs.pickle_records import (
     ARRAYS,
     CHUMPY,
+    MAX_DEPTH,
+    MAX_VALUES,
     SPARSE,
     STORAGE_DTYPES,
     TENSORS,
@@ -36,6 +39,12 @@ from bigs.pickle_records import (
 )
 
 _DTYPE_CODE = re.compile(r"[<>|=]?(b1|\?|[iu][1248]|f[248]|c8|c16|S\d+|U\d+|O[48]?)")
+# Bytes that are made for each byte of a file: text becomes bytes, a storage, a tensor. Small files get more.
+_MADE_PER_BYTE, _MADE_AT_LEAST = 8, 32 << 20
+# What a member of a list, dictionary or set takes, in bytes.
+_BYTES_PER_MEMBER = 64
+# Of a sparse matrix that will be made dense: 4000 vertices have 64 000 in MANO's.
+MAX_SPARSE_VALUES = 1 << 24
 _TORCH_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
 
@@ -57,7 +66,8 @@ def restricted_load(file: BinaryIO, *, name: str, allow: frozenset[Global] = ARR
         InputError: the pickle names anything else, or is damaged.
     """
     try:
-        return _Builder(allow).value(load_records(io.BytesIO(file.read()), allow))
+        data = file.read()
+        return _Builder(allow, len(data)).value(load_records(io.BytesIO(data), allow))
     except Refused as refusal:
         raise InputError(
             f"{name}: expected a pickle of plain data, found the global '{refusal}', which is refused "
@@ -91,8 +101,12 @@ def load_npy(path: str | Path, *, allow: frozenset[Global] = TENSORS) -> Any:
 class _Builder:
     """Turns records into values, depth first. Shared parts stay shared; a cycle is an error."""
 
-    def __init__(self, allow: frozenset[Global]) -> None:
+    def __init__(self, allow: frozenset[Global], size: int) -> None:
+        """`size` is that of the file in bytes, which bounds what is made of it."""
         self._allow = allow
+        self._most = MAX_VALUES + 2 * size
+        self._left = _MADE_AT_LEAST + _MADE_PER_BYTE * size
+        self._sizes: dict[int, int] = {}  # of results, with everything shared written out
         self._done: dict[int, Any] = {}
         self._active: set[int] = set()
         # Keeps every visited object alive, so that an id in `_done` cannot come to mean another object.
@@ -105,18 +119,65 @@ class _Builder:
             return self._done[id(raw)]
         if id(raw) in self._active:
             raise ValueError("an object that contains itself")
+        if len(self._active) >= MAX_DEPTH:
+            raise ValueError(f"data nested more than {MAX_DEPTH} levels deep")
         self._active.add(id(raw))
         self._alive.append(raw)
         result = self._record(raw) if isinstance(raw, Record) else self._container(raw)
         self._active.discard(id(raw))
         self._done[id(raw)] = result
+        self._count(result)
         return result
+
+    def spend(self, count: int) -> None:
+        """Take note of bytes that are about to be made, or have just been.
+
+        Raises:
+            ValueError: they are out of proportion to the file.
+        """
+        self._left -= count
+        if self._left < 0:
+            raise ValueError("more data than a file of this size can hold")
+
+    def size(self, value: Any) -> int:
+        """How many values there are in a result of `value`, with everything shared written out."""
+        return self._sizes.get(id(value), 1) if not isinstance(value, str | bytes) else 1 + len(value)
+
+    def _count(self, result: Any) -> None:
+        if isinstance(result, dict):
+            size = 1 + sum(self.size(key) + self.size(item) for key, item in result.items())
+            made = 2 * _BYTES_PER_MEMBER * len(result)
+        elif isinstance(result, list | tuple | set | frozenset):
+            size, made = 1 + sum(map(self.size, result)), _BYTES_PER_MEMBER * len(result)
+        elif isinstance(result, np.ndarray):
+            inside = sum(map(self.size, result.ravel())) if result.dtype.hasobject else result.size
+            size, made = 1 + inside, result.nbytes
+        elif isinstance(result, torch.Tensor):
+            size, made = 1 + result.numel(), result.nbytes
+        elif isinstance(result, str | bytes):
+            size, made = 1 + len(result), len(result)
+        else:
+            size, made = 1, _BYTES_PER_MEMBER
+        if size > self._most:
+            raise ValueError(
+                "more values than a file of this size can hold, once shared parts are written out"
+            )
+        self._sizes[id(result)] = size
+        self.spend(made)
+
+    def keys(self, values: Iterable[Any]) -> list[Any]:
+        """Values that are about to be hashed."""
+        listed = list(values)
+        self.spend(_BYTES_PER_MEMBER * sum(map(self.size, listed)))
+        return listed
 
     def _container(self, raw: Any) -> Any:
         if type(raw) is dict:
-            return {self.value(key): self.value(item) for key, item in raw.items()}
+            keys = self.keys(map(self.value, raw))
+            return dict(zip(keys, map(self.value, raw.values()), strict=True))
         if type(raw) in (list, tuple, set, frozenset):
-            return type(raw)([self.value(item) for item in raw])
+            items = [self.value(item) for item in raw]
+            return type(raw)(items if type(raw) in (list, tuple) else self.keys(items))
         if type(raw) is bytearray:
             return bytes(raw)
         what = ".".join(raw.key) if isinstance(raw, type) and issubclass(raw, Record) else type(raw).__name__
@@ -137,6 +198,7 @@ class _Builder:
     def buffer(self, raw: Any) -> bytes:
         """The bytes of `raw`; Python 2 wrote them as a string, which came here as latin-1."""
         data = self.value(raw)
+        self.spend(self.size(data))
         if isinstance(data, str):
             return data.encode("latin1")
         if not isinstance(data, bytes):
@@ -154,6 +216,8 @@ class _Builder:
         if type(reference) is not PersistentId:
             raise TypeError("a torch storage that is not a storage")
         kind, storage_type, key, _location, count, *view = reference.args[0]
+        if type(kind) is not str or type(key) is not str or len(keys) != 1:
+            raise TypeError("a torch storage of an unknown kind")
         if kind != "storage" or keys != [key] or any(part is not None for part in view):
             raise ValueError("a torch storage of an unknown kind")
         dtype = STORAGE_DTYPES[storage_type.key[1]]
@@ -169,7 +233,7 @@ def _from_bytes(data: bytes, dtype: np.dtype, shape: tuple[int, ...], order: Any
 
 def _shape(value: Any) -> tuple[int, ...]:
     if type(value) is not tuple or not all(isinstance(n, int | np.integer) and n >= 0 for n in value):
-        raise ValueError(f"the array shape {value!r}")
+        raise ValueError(f"the array shape {shown(value)}")
     return tuple(int(n) for n in value)
 
 
@@ -181,9 +245,33 @@ def _build_dtype(builder: _Builder, record: Record) -> np.dtype:
         or not _DTYPE_CODE.fullmatch(code)
         or any(part is not None for part in state[2:5])
     ):
-        raise ValueError(f"the array type {code!r}")
+        raise ValueError(f"the array type {shown(code)}")
     dtype = np.dtype("O" if code[:1] == "O" else code)
     return dtype.newbyteorder(">") if state[1] == ">" else dtype
+
+
+def _dtype(builder: _Builder, raw: Any) -> np.dtype:
+    """A dtype that is one: NumPy would make one of a list, and of what the list holds."""
+    dtype = builder.value(raw)
+    if not isinstance(dtype, np.dtype):
+        raise TypeError(f"{type(dtype).__name__} where an array type should be")
+    return dtype
+
+
+def _plain_numbers(builder: _Builder, raw: Any) -> np.ndarray:
+    """An array of numbers, or a list of some as one; never of text, which NumPy pads to the longest."""
+    value = builder.value(raw)
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        if type(part) in (list, tuple):
+            waiting += part
+        elif not isinstance(part, bool | int | float | np.number | np.ndarray):
+            raise TypeError(f"{type(part).__name__} where numbers should be")
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise TypeError(f"an array of {array.dtype} where numbers should be")
+    return array
 
 
 def _build_array(builder: _Builder, record: Record) -> np.ndarray:
@@ -191,7 +279,7 @@ def _build_array(builder: _Builder, record: Record) -> np.ndarray:
     if not (isinstance(cls, type) and issubclass(cls, Record) and cls.key == ("numpy", "ndarray")):
         raise TypeError("an array that is not a plain numpy.ndarray")
     _version, raw_shape, raw_dtype, fortran, data = record.state
-    shape, dtype = _shape(builder.value(raw_shape)), builder.value(raw_dtype)
+    shape, dtype = _shape(builder.value(raw_shape)), _dtype(builder, raw_dtype)
     if dtype != np.dtype(object):
         return _from_bytes(builder.buffer(data), dtype, shape, "F" if fortran else "C")
     items = builder.value(data)
@@ -203,21 +291,27 @@ def _build_array(builder: _Builder, record: Record) -> np.ndarray:
 
 def _build_array_from_buffer(builder: _Builder, record: Record) -> np.ndarray:
     data, raw_dtype, raw_shape, order, *axes = record.args
-    dtype, shape = builder.value(raw_dtype), _shape(builder.value(raw_shape))
+    dtype, shape = _dtype(builder, raw_dtype), _shape(builder.value(raw_shape))
     array = _from_bytes(builder.buffer(data), dtype, shape, order)
     return array.transpose(builder.value(axes[0])) if order == "K" and axes else array
 
 
 def _build_scalar(builder: _Builder, record: Record) -> Any:
-    dtype, data = builder.value(record.args[0]), builder.buffer(record.args[1])
+    dtype, data = _dtype(builder, record.args[0]), builder.buffer(record.args[1])
     return _from_bytes(data, dtype, (), "C")[()]
 
 
 def _build_sparse(builder: _Builder, record: Record) -> Any:
-    state = builder.value(record.state)
+    state = record.state
     matrix_type = getattr(scipy.sparse, record.key[1])
-    parts = tuple(np.asarray(state[part]) for part in ("data", "indices", "indptr"))
-    matrix = matrix_type(parts, shape=_shape(state["_shape"] if "_shape" in state else state["shape"]))
+    parts = tuple(_plain_numbers(builder, state[part]) for part in ("data", "indices", "indptr"))
+    shape = _shape(builder.value(state["_shape"] if "_shape" in state else state["shape"]))
+    if math.prod(shape) > MAX_SPARSE_VALUES:
+        raise ValueError(
+            f"a sparse matrix of shape {shown(list(shape))}, of more than {MAX_SPARSE_VALUES} values"
+        )
+    builder.spend(sum(part.nbytes for part in parts))
+    matrix = matrix_type(parts, shape=shape)
     # SciPy's compiled loops trust the indices; this is what looks at every one of them.
     matrix.check_format(full_check=True)
     return matrix
@@ -227,10 +321,12 @@ def _build_chumpy(builder: _Builder, record: Record) -> np.ndarray:
     """A `Ch` holds its array as `x`; a `Select` takes `idxs` of `a`, flattened, into `preferred_shape`."""
     state = record.state
     if record.key[1] == "Ch":
-        return np.asarray(builder.value(state["x"]))
-    source = np.asarray(builder.value(state["a"]))
-    picked = source.ravel()[np.asarray(builder.value(state["idxs"]))]
-    return picked.reshape(builder.value(state["preferred_shape"])) if "preferred_shape" in state else picked
+        return _plain_numbers(builder, state["x"])
+    source, index = (_plain_numbers(builder, state[key]) for key in ("a", "idxs"))
+    picked = source.ravel()[index]
+    if "preferred_shape" not in state:
+        return picked
+    return picked.reshape(_plain_numbers(builder, state["preferred_shape"]).tolist())
 
 
 def _build_tensor(builder: _Builder, record: Record) -> torch.Tensor:
@@ -245,18 +341,23 @@ def _build_tensor(builder: _Builder, record: Record) -> torch.Tensor:
 
 
 def _build_from_iterable(make: type) -> Callable[[_Builder, Record], Any]:
-    return lambda builder, record: make(*(builder.value(arg) for arg in record.args[:1]))
+    def build(builder: _Builder, record: Record) -> Any:
+        given = [builder.value(arg) for arg in record.args[:1]]
+        return make(*(value if make is tuple else builder.keys(value) for value in given))
+
+    return build
 
 
 def _build_dict(builder: _Builder, record: Record) -> dict[Any, Any]:
-    given = dict(builder.value(record.args[0])) if record.args else {}
-    return given | builder.value(getattr(record, "entries", {}))
+    given = builder.value(record.args[0]) if record.args else {}
+    builder.spend(_BYTES_PER_MEMBER * builder.size(given))
+    return dict(given) | builder.value(getattr(record, "entries", {}))
 
 
 def _build_encoded(builder: _Builder, record: Record) -> bytes:
     """Python 3 writes bytes as `codecs.encode(text, "latin1")` in the protocols that Python 2 can read."""
     if record.args[1:] not in (("latin1",), ("latin-1",)):
-        raise ValueError(f"the text encoding {record.args[1:]!r}")
+        raise ValueError(f"the text encoding {shown(record.args[1:])}")
     return builder.value(record.args[0]).encode("latin1")
 
 

@@ -47,6 +47,7 @@ def number_field(where: str, value: Any) -> float:
 
 def _numbers(where: str, value: Any) -> np.ndarray:
     """`value` as float64, NaN and infinities as they are."""
+    _check_no_text(where, value)
     try:
         array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:
@@ -62,6 +63,17 @@ def _numbers(where: str, value: Any) -> np.ndarray:
     if largest > LARGEST:
         raise InputError(f"{where}: expected numbers of at most {LARGEST:g}, found {largest:.3g}")
     return array
+
+
+def _check_no_text(where: str, value: Any) -> None:
+    """Refuse text in lists before NumPy makes every member as long as the longest."""
+    waiting = list(value) if isinstance(value, list | tuple) else []
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, list | tuple):
+            waiting += part
+        elif isinstance(part, str | bytes):
+            raise InputError(f"{where}: expected an array of numbers, found {shown(value)}")
 
 
 def _kind(value: Any, array: np.ndarray) -> str:

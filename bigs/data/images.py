@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from bigs.checks import InputError, found_at
+from bigs.checks import MAX_PIXELS, InputError, check_pixels, found_at
+from bigs.files import open_regular
 from bigs.names import check_name
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
@@ -17,7 +20,39 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MASK_SUFFIXES = (".png",)
 
 # What Pillow raises for files that are not images, are cut short, or unpack to an absurd size.
-_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    Image.DecompressionBombError,
+    Image.DecompressionBombWarning,
+)
+# Pillow opens any format by its content, and hands some to other programs; these it decodes itself.
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+_FRAME_FORMATS = ("PNG", "JPEG")
+# A picture of `MAX_PIXELS` in 16 bits of four colours, stored as it is.
+_MAX_PICTURE_BYTES = 1 << 29
+# It warns first and refuses at twice the size; a warning is a second line beside our sentence.
+warnings.filterwarnings("error", category=Image.DecompressionBombWarning)
+
+
+@contextmanager
+def open_picture(path: Path, formats: tuple[str, ...] = PICTURE_FORMATS) -> Iterator[Image.Image]:
+    """A picture of one of some formats, not yet decoded, of a size that may be decoded.
+
+    Raises:
+        InputError: no such file, no regular file, another format, or too many pixels; and what Pillow raises
+            while it is decoded inside the block.
+    """
+    with open_regular(path, "an image", _MAX_PICTURE_BYTES) as file:
+        try:
+            with Image.open(file, formats=formats) as image:
+                check_pixels(str(path), image.width, image.height)
+                yield image
+        except InputError:
+            raise
+        except UNREADABLE as error:
+            raise InputError(f"{path}: expected a readable image, found {_reason(error, formats)}") from None
 
 
 def list_frames(folder: Path, suffixes: Sequence[str]) -> tuple[Path, ...]:
@@ -114,23 +149,18 @@ def decode_frames(
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, str]:
-    try:
-        with Image.open(path) as image:
-            if size is not None and image.size != size:
-                raise InputError(
-                    f"{path}: expected {size[0]} x {size[1]} pixels as in the first frame, "
-                    f"found {image.width} x {image.height}"
-                )
-            return np.array(image), image.mode
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected an image, found no such file") from None
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: expected a readable image, found {_reason(error)}") from None
+    with open_picture(path, _FRAME_FORMATS) as image:
+        if size is not None and image.size != size:
+            raise InputError(
+                f"{path}: expected {size[0]} x {size[1]} pixels as in the first frame, "
+                f"found {image.width} x {image.height}"
+            )
+        return np.array(image), image.mode
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException, formats: Sequence[str]) -> str:
+    if isinstance(error, Image.DecompressionBombError | Image.DecompressionBombWarning):
+        return f"one that unpacks to more than {MAX_PIXELS} pixels ({error})"
     if isinstance(error, Image.UnidentifiedImageError):
-        return "a file that is not an image"
+        return f"a file that is not an image ({', '.join(formats)})"
     return f"a damaged or truncated one ({error})"

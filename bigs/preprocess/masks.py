@@ -17,6 +17,7 @@ from PIL import Image
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, found_at
+from bigs.data.images import open_picture
 from bigs.preprocess.artefacts import MASKS, MASKS_FILE, FrameSet, write_json
 from bigs.preprocess.matching import match_names
 from bigs.preprocess.source import PICTURE_SUFFIXES, natural_order
@@ -187,7 +188,7 @@ def _table(values: Mapping[Entity, int]) -> np.ndarray:
 
 def _read_labels(path: Path) -> np.ndarray:
     """Stored values [H, W] uint8: the index of a palette image, the grey value of another."""
-    with _opened(path) as image:
+    with open_picture(path) as image:
         if image.mode not in ("L", "P", "1"):
             pixels = np.asarray(image.convert("RGB"))
             if (pixels != pixels[..., :1]).any():
@@ -201,29 +202,12 @@ def _read_labels(path: Path) -> np.ndarray:
 
 def _read_bright(path: Path) -> np.ndarray:
     """Where an image of one entity shows it, [H, W] bool."""
-    with _opened(path) as image:
+    with open_picture(path) as image:
         if image.mode == "P":
             return np.asarray(image) > 0
         grey = np.asarray(image.convert("L"))
     # Some tools write 0 and 1.
     return grey > (0 if grey.max() <= 1 else _BRIGHT)
-
-
-class _opened:
-    """A decoded image, or one sentence that says why not."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            self.image = Image.open(path)
-            self.image.load()
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise InputError(f"{path}: expected a readable mask, found a damaged one ({error})") from None
-
-    def __enter__(self) -> Image.Image:
-        return self.image
-
-    def __exit__(self, *exc: object) -> None:
-        self.image.close()
 
 
 def _resized(path: Path, mask: np.ndarray, frames: FrameSet) -> np.ndarray:

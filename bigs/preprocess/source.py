@@ -8,16 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, ImageOps
 
 from bigs.checks import InputError, found_at
+from bigs.data.images import open_picture
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 # Folders of images say nothing of time.
 FOLDER_FPS = 30.0
-# What Pillow raises for files that are not images, are cut short, or unpack to an absurd size.
-_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,9 @@ class Source:
 
     def _folder_pictures(self) -> Iterator[tuple[str, np.ndarray]]:
         for path in self.images:
-            try:
-                with Image.open(path) as image:
-                    yield path.name, np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-            except _UNREADABLE as error:
-                raise InputError(
-                    f"{path}: expected a readable image, found a damaged one ({error})"
-                ) from None
+            with open_picture(path) as image:
+                pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            yield path.name, pixels
 
     def _video_pictures(self) -> Iterator[tuple[str, np.ndarray]]:
         av = _import_av(self.path)
@@ -118,12 +113,9 @@ def _import_av(path: Path):  # type: ignore[no-untyped-def]  # PyAV's stubs are 
 
 def _exif(path: Path) -> dict[int, object]:
     """EXIF entries by number, those about the exposure among them."""
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: expected a readable image, found a damaged one ({error})") from None
+    with open_picture(path) as image:
+        exif = image.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
