@@ -48,7 +48,8 @@ def test_what_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "zero.png").symlink_to("/dev/zero")
     (tmp_path / "folder.png").mkdir()
-    for name, words in (
+    kinds = {"pipe": "a pipe", "zero": "a device", "folder": "a folder", "none": "no such"}
+    for name, words in kinds.items():
         ("pipe", "a pipe"),
         ("zero", "a device"),
         ("folder", "a folder"),
