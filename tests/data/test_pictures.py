@@ -50,11 +50,6 @@ def test_what_is_no_file(tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
     kinds = {"pipe": "a pipe", "zero": "a device", "folder": "a folder", "none": "no such"}
     for name, words in kinds.items():
-        ("pipe", "a pipe"),
-        ("zero", "a device"),
-        ("folder", "a folder"),
-        ("none", "no such"),
-    ):
         with pytest.raises(InputError, match=f"{name}.png: expected an image, found {words}"):
             read_image(tmp_path / f"{name}.png")
 

@@ -118,7 +118,7 @@ def test_unusable_folders_are_told_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found colours"):
         open_masks(tmp_path, FRAMES).label(4)
     (tmp_path / "x4.png").write_bytes(b"\x89PNG damaged")
-    with pytest.raises(InputError, match="expected a readable mask"):
+    with pytest.raises(InputError, match="expected a readable image"):
         open_masks(tmp_path, FRAMES).label(4)
 
 
