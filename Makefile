@@ -41,13 +41,13 @@ lint:
 	cargo clippy --quiet --workspace --all-targets -- -D warnings
 
 test-rust:
-	cargo test --quiet -p bigs-raster
+	cargo test --quiet -p bigs-raster -p bigs-raster-checks
 
 test-python:
 	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist worksteal
 
 bench: setup
-	cargo bench -p bigs-raster
+	cargo bench -p bigs-raster-checks
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist

@@ -64,13 +64,8 @@ def rasterize_forward(
 
 def rasterize_backward(
     state: RasterState,
-    arrays: _Arrays,
+    arrays: tuple[NDArray[Any], ...],
     counts: _Counts,
-    width: int,
-    height: int,
-    settings: RasterSettings,
-    render_mode: str,
-    camera_model: str,
     v_colors: NDArray[Any] | None,
     v_alphas: NDArray[Any] | None,
     wanted: tuple[bool, ...],
@@ -86,7 +81,10 @@ def rasterize_backward(
     NDArray[Any],
     int,
 ]:
-    """Flat gradients of the seven differentiable inputs, of means2d, its absolute form, and tiles skipped."""
+    """Flat gradients of the seven differentiable inputs, of means2d, its absolute form, and tiles skipped.
+
+    `arrays` and `counts` are those of the Gaussians, the first five of the forward call that made the state.
+    """
 
 # dirs [.., N, 3], coeffs [N, K, 3], mask [.., N] of bool or None: all Gaussians of one place, then the next.
 _HarmonicsArrays = tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]
@@ -103,7 +101,11 @@ def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""
 
 def simd_level() -> str:
-    """The CPU feature level the kernels run at: avx512, avx2, neon or baseline."""
+    """The CPU feature level the kernels run at: avx512, avx2, neon or baseline.
+
+    Raises:
+        ValueError: `BIGS_RASTER_SIMD` names none that this machine has.
+    """
 
 def fma_peak_gflops() -> float:
     """Measured peak of one thread at that level, 10⁹ float32 operations per second; a multiply-add is two."""

@@ -66,7 +66,9 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         # Saved to notice inputs changed in place before the backward pass; what it reads are the arrays.
         ctx.save_for_backward(means2d, *inputs)
-        ctx.call, ctx.arrays, ctx.state, ctx.info, ctx.absgrad = call, arrays, state, info, absgrad
+        # Of the inputs it needs the Gaussians; the state knows the rest.
+        ctx.arrays, ctx.counts, ctx.state = arrays[:5], call.counts[:5], state
+        ctx.info, ctx.absgrad = info, absgrad
         ctx.set_materialize_grads(False)
         return images
 
@@ -75,16 +77,10 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, v_colors: torch.Tensor | None, v_alphas: torch.Tensor | None) -> tuple:
         means2d, *inputs = ctx.saved_tensors
         want_means2d, *six, _Ks, backgrounds, _mask = ctx.needs_input_grad[6:]
-        call: Call = ctx.call
         *gradients, v_backgrounds, v_means2d, absolute, tiles_skipped = _raster.rasterize_backward(
             ctx.state,
             ctx.arrays,
-            call.counts,
-            call.width,
-            call.height,
-            call.settings,
-            call.render_mode,
-            call.camera_model,
+            ctx.counts,
             None if v_colors is None else _array(v_colors),
             None if v_alphas is None else _array(v_alphas),
             (*six, backgrounds, want_means2d, ctx.absgrad and want_means2d),

@@ -1,6 +1,6 @@
 //! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied.
 
-use bigs_raster::{BatchInputs, BatchShape, CameraModel, Scalar, Slabs};
+use bigs_raster::{BatchInputs, BatchShape, CameraModel, GaussianSlabs, Scalar, Slabs};
 use numpy::{
     Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
@@ -28,28 +28,103 @@ pub(crate) fn slice<'py, T: Element>(
 /// How many slabs an array holds: entries, cameras.
 pub(crate) type Count = (usize, usize);
 
+/// The values of an array in the order of its axes.
+pub(crate) fn contiguous<'a, U: Element>(
+    name: &str,
+    array: &'a PyReadonlyArrayDyn<'_, U>,
+) -> PyResult<&'a [U]> {
+    // `as_slice` alone takes Fortran order, too.
+    match array.as_slice() {
+        Ok(values) if array.is_c_contiguous() => Ok(values),
+        _ => Err(PyValueError::new_err(format!(
+            "{name}: expected a C-contiguous array"
+        ))),
+    }
+}
+
+/// The values of an array whose last axis has D of them, in rows.
+pub(crate) fn rows<'a, U: Element, const D: usize>(
+    name: &str,
+    array: &'a PyReadonlyArrayDyn<'_, U>,
+) -> PyResult<&'a [[U; D]]> {
+    if array.shape().last() != Some(&D) {
+        return Err(PyValueError::new_err(format!(
+            "{name}: expected rows of {D} values, found shape {:?}",
+            array.shape()
+        )));
+    }
+    Ok(contiguous(name, array)?.as_chunks().0)
+}
+
+/// The arrays of Gaussians, borrowed for as long as this lives.
+pub(crate) struct Gaussians<'py, T: Element> {
+    counts: [Count; 5],
+    arrays: Vec<PyReadonlyArrayDyn<'py, T>>,
+}
+
+/// Names of arrays, and how many values the last axis has where that is fixed.
+const GAUSSIANS: [(&str, Option<usize>); 5] = [
+    ("means", Some(3)),
+    ("quats", Some(4)),
+    ("scales", Some(3)),
+    ("opacities", None),
+    ("colors", None),
+];
+
+impl<'py, T: Scalar + Element> Gaussians<'py, T> {
+    /// Reads (means, quats, scales, opacities, colors), the first entries of a tuple.
+    pub(crate) fn extract(arrays: &Bound<'py, PyTuple>, counts: [Count; 5]) -> PyResult<Self> {
+        if arrays.len() < GAUSSIANS.len() {
+            return Err(PyTypeError::new_err(
+                "arrays: expected means, quats, scales, opacities and colors",
+            ));
+        }
+        let mut own = Vec::new();
+        for (index, (name, last)) in GAUSSIANS.into_iter().enumerate() {
+            let array: PyReadonlyArrayDyn<'py, T> = slice(name, &arrays.get_item(index)?)?;
+            if let Some(size) = last.filter(|size| array.shape().last() != Some(size)) {
+                return Err(PyValueError::new_err(format!(
+                    "{name}: expected {size} values on the last axis, found shape {:?}",
+                    array.shape()
+                )));
+            }
+            own.push(array);
+        }
+        Ok(Self { counts, arrays: own })
+    }
+
+    pub(crate) fn slabs(&self) -> PyResult<GaussianSlabs<'_, T>> {
+        let slabs = |index: usize| slabs(GAUSSIANS[index].0, &self.arrays[index], self.counts[index]);
+        Ok(GaussianSlabs {
+            means: slabs(0)?,
+            quats: slabs(1)?,
+            scales: slabs(2)?,
+            opacities: slabs(3)?,
+            colors: slabs(4)?,
+        })
+    }
+
+    /// The size of an axis, counted from the end; 0 where there is none.
+    fn axis(&self, index: usize, from_end: usize) -> usize {
+        let shape = self.arrays[index].shape();
+        shape.len().checked_sub(from_end).map_or(0, |axis| shape[axis])
+    }
+}
+
 /// The arrays of a call, borrowed for as long as this lives.
 pub(crate) struct Arrays<'py, T: Element> {
-    counts: [Count; NAMES.len() + 2],
-    floats: Vec<PyReadonlyArrayDyn<'py, T>>,
+    counts: [Count; 9],
+    gaussians: Gaussians<'py, T>,
+    viewmats: PyReadonlyArrayDyn<'py, T>,
+    ks: PyReadonlyArrayDyn<'py, T>,
     backgrounds: Option<PyReadonlyArrayDyn<'py, T>>,
     pixel_mask: Option<PyReadonlyArrayDyn<'py, bool>>,
 }
 
-const NAMES: [&str; 7] = [
-    "means",
-    "quats",
-    "scales",
-    "opacities",
-    "colors",
-    "viewmats",
-    "Ks",
-];
-
 impl<'py, T: Scalar + Element> Arrays<'py, T> {
     /// Reads (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds | None, pixel_mask | None).
-    pub(crate) fn extract(arrays: &Bound<'py, PyTuple>, counts: [Count; NAMES.len() + 2]) -> PyResult<Self> {
-        if arrays.len() != NAMES.len() + 2 {
+    pub(crate) fn extract(arrays: &Bound<'py, PyTuple>, counts: [Count; 9]) -> PyResult<Self> {
+        if arrays.len() != counts.len() {
             return Err(PyTypeError::new_err("arrays: expected nine entries"));
         }
         let optional = |index: usize| {
@@ -57,13 +132,12 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
                 .get_item(index)
                 .map(|item| (!item.is_none()).then_some(item))
         };
+        let [means, quats, scales, opacities, colors, ..] = counts;
         Ok(Self {
             counts,
-            floats: NAMES
-                .iter()
-                .enumerate()
-                .map(|(index, name)| slice(name, &arrays.get_item(index)?))
-                .collect::<PyResult<_>>()?,
+            gaussians: Gaussians::extract(arrays, [means, quats, scales, opacities, colors])?,
+            viewmats: slice("viewmats", &arrays.get_item(5)?)?,
+            ks: slice("Ks", &arrays.get_item(6)?)?,
             backgrounds: optional(7)?.map(|item| slice("backgrounds", &item)).transpose()?,
             pixel_mask: optional(8)?.map(|item| slice("pixel_mask", &item)).transpose()?,
         })
@@ -75,34 +149,25 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
         (width, height): (usize, usize),
         camera_model: CameraModel,
     ) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
-        let slabs = |index: usize| slabs(NAMES[index], &self.floats[index], self.counts[index]);
         let backgrounds = self.backgrounds.as_ref();
         let pixel_mask = self.pixel_mask.as_ref();
         let inputs = BatchInputs {
-            means: slabs(0)?,
-            quats: slabs(1)?,
-            scales: slabs(2)?,
-            opacities: slabs(3)?,
-            colors: slabs(4)?,
-            viewmats: slabs(5)?,
-            ks: slabs(6)?,
+            gaussians: self.gaussians.slabs()?,
+            viewmats: slabs("viewmats", &self.viewmats, self.counts[5])?,
+            ks: slabs("Ks", &self.ks, self.counts[6])?,
             camera_model,
             backgrounds: backgrounds
-                .map(|a| self::slabs("backgrounds", a, self.counts[7]))
+                .map(|a| slabs("backgrounds", a, self.counts[7]))
                 .transpose()?,
             pixel_mask: pixel_mask
-                .map(|a| self::slabs("pixel_mask", a, self.counts[8]))
+                .map(|a| slabs("pixel_mask", a, self.counts[8]))
                 .transpose()?,
-        };
-        let last = |index: usize, from_end: usize| {
-            let shape = self.floats[index].shape();
-            shape.len().checked_sub(from_end).map_or(0, |axis| shape[axis])
         };
         let shape = BatchShape {
             entries: self.counts.iter().fold(1, |size, count| wider(size, count.0)),
             cameras: self.counts.iter().fold(1, |size, count| wider(size, count.1)),
-            gaussians: last(0, 2),
-            channels: last(4, 1),
+            gaussians: self.gaussians.axis(0, 2),
+            channels: self.gaussians.axis(4, 1),
             width,
             height,
         };
@@ -120,11 +185,8 @@ fn slabs<'a, U: Element>(
     array: &'a PyReadonlyArrayDyn<'_, U>,
     (entries, cameras): Count,
 ) -> PyResult<Slabs<'a, U>> {
-    let data = array
-        .as_slice()
-        .map_err(|_| PyValueError::new_err(format!("{name}: expected a C-contiguous array")))?;
     Ok(Slabs {
-        data,
+        data: contiguous(name, array)?,
         entries,
         cameras,
     })

@@ -11,7 +11,7 @@ use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
-use crate::convert::{Arrays, Count, array, gradient, slice};
+use crate::convert::{Arrays, Count, Gaussians, array, contiguous, gradient, slice};
 
 /// What the forward pass keeps for the backward pass. Opaque; usable any number of times.
 #[pyclass(frozen, module = "bigs._raster")]
@@ -180,20 +180,17 @@ fn rasterize_forward<'py>(
 fn backward<'py, T: Kind>(
     py: Python<'py>,
     state: &BatchState<T>,
-    arrays: &Arrays<'py, T>,
-    (width, height): (usize, usize),
-    settings: &RasterSettings,
-    (mode, camera_model): (RenderMode, CameraModel),
+    arrays: &Gaussians<'py, T>,
     [v_colors, v_alphas]: [Option<&Bound<'py, PyAny>>; 2],
     wanted: Wanted,
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (shape, inputs) = arrays.inputs((width, height), camera_model)?;
+    let gaussians = arrays.slabs()?;
     let v_colors = v_colors.map(|v| slice::<T>("v_colors", v)).transpose()?;
     let v_alphas = v_alphas.map(|v| slice::<T>("v_alphas", v)).transpose()?;
-    let v_colors = v_colors.as_ref().map(|v| v.as_slice()).transpose()?;
-    let v_alphas = v_alphas.as_ref().map(|v| v.as_slice()).transpose()?;
+    let v_colors = v_colors.as_ref().map(|v| contiguous("v_colors", v)).transpose()?;
+    let v_alphas = v_alphas.as_ref().map(|v| contiguous("v_alphas", v)).transpose()?;
     let gradients = run(py, || {
-        Batch::new_trusted(shape, inputs, settings, mode)?.render_vjp(state, v_colors, v_alphas, wanted)
+        state.vjp_of_rendered(&gaussians, v_colors, v_alphas, wanted)
     })?;
     (
         gradient(py, gradients.means),
@@ -214,25 +211,18 @@ fn backward<'py, T: Kind>(
 /// layout of their input, of means2d `[views, N, 2]`, its absolute form, and the number of tiles without incoming
 /// gradient. `wanted` has
 /// one flag per array; what is not wanted is an empty one. Where means2d is wanted, what passes through it is left out
-/// of means and viewmats. Gradients of the images may be None for zeros. Takes the inputs of the forward call that made
-/// `state`.
+/// of means and viewmats. Gradients of the images may be None for zeros. `arrays` are means, quats, scales, opacities and
+/// colors of the forward call that made `state`, which knows the rest. Raises ValueError.
 #[pyfunction]
 fn rasterize_backward<'py>(
     py: Python<'py>,
     state: &Bound<'py, RasterState>,
     arrays: &Bound<'py, PyTuple>,
-    counts: [Count; 9],
-    width: usize,
-    height: usize,
-    settings: Settings,
-    render_mode: &str,
-    camera_model: &str,
+    counts: [Count; 5],
     v_colors: Option<&Bound<'py, PyAny>>,
     v_alphas: Option<&Bound<'py, PyAny>>,
     wanted: [bool; 9],
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let (settings, size) = (settings.into(), (width, height));
-    let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
     let [
         means,
         quats,
@@ -258,27 +248,9 @@ fn rasterize_backward<'py>(
     };
     let (v, kept) = ([v_colors, v_alphas], &state.get().kept);
     if let Some(state) = f32::kept(kept) {
-        backward(
-            py,
-            state,
-            &Arrays::extract(arrays, counts)?,
-            size,
-            &settings,
-            mode,
-            v,
-            wanted,
-        )
+        backward(py, state, &Gaussians::extract(arrays, counts)?, v, wanted)
     } else if let Some(state) = f64::kept(kept) {
-        backward(
-            py,
-            state,
-            &Arrays::extract(arrays, counts)?,
-            size,
-            &settings,
-            mode,
-            v,
-            wanted,
-        )
+        backward(py, state, &Gaussians::extract(arrays, counts)?, v, wanted)
     } else {
         Err(PyTypeError::new_err(
             "state: expected one made by rasterize_forward",

@@ -5,10 +5,11 @@ use std::time::Instant;
 
 use bigs_raster::stages::Stages;
 use bigs_raster::{Camera, Gaussians, Intrinsics, RasterError, RenderMode, Renderer};
-use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::PyReadonlyArrayDyn;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
+use crate::convert::{contiguous, rows};
 use crate::{Settings, run, value_error};
 
 /// The CPU feature level the kernels run at: avx512, avx2, neon or baseline. Raises ValueError for an unknown
@@ -46,13 +47,13 @@ pub(crate) fn time_engine<'py>(
         rows("means", means)?,
         rows("quats", quats)?,
         rows("scales", scales)?,
-        opacities.as_slice()?,
-        colors.as_slice()?,
+        contiguous("opacities", opacities)?,
+        contiguous("colors", colors)?,
         3,
     )
     .map_err(value_error)?;
     let [viewmat, k] = &camera;
-    let (viewmat, k) = (rows::<4>("viewmat", viewmat)?, rows::<3>("K", k)?);
+    let (viewmat, k) = (rows::<f32, 4>("viewmat", viewmat)?, rows::<f32, 3>("K", k)?);
     let (&[row0, row1, row2, row3], &[[fx, _, cx], [_, fy, cy], _]) = (viewmat, k) else {
         return Err(PyValueError::new_err(
             "camera: expected viewmat [4, 4] and K [3, 3]",
@@ -60,7 +61,7 @@ pub(crate) fn time_engine<'py>(
     };
     let intrinsics = Intrinsics { fx, fy, cx, cy };
     let camera = Camera::new([row0, row1, row2, row3], intrinsics, width, height).map_err(value_error)?;
-    let v_colors = v_colors.as_slice()?;
+    let v_colors = contiguous("v_colors", &v_colors)?;
     run(py, || timed(&gaussians, &camera, &settings.into(), v_colors))
 }
 
@@ -88,7 +89,7 @@ fn timed(
     lap();
     stages.composite_vjp(v_colors, &v_alphas)?;
     let composite_vjp = lap();
-    black_box(stages.project_vjp());
+    black_box(stages.project_vjp()?);
     let project_vjp = lap();
     drop(stages);
 
@@ -96,7 +97,7 @@ fn timed(
     lap();
     let frame = renderer.render(gaussians, camera, None)?;
     let forward = lap();
-    black_box(renderer.render_vjp(gaussians, camera, None, &frame, v_colors, &v_alphas)?);
+    black_box(frame.vjp(gaussians, v_colors, &v_alphas)?);
     let backward = lap();
     Ok(vec![
         ("project", project),
@@ -107,14 +108,4 @@ fn timed(
         ("forward", forward),
         ("backward", backward),
     ])
-}
-
-fn rows<'a, const D: usize>(name: &str, array: &'a Array<'_>) -> PyResult<&'a [[f32; D]]> {
-    match array.as_slice()?.as_chunks() {
-        (rows, []) => Ok(rows),
-        _ => Err(PyValueError::new_err(format!(
-            "{name}: expected rows of {D} values, found shape {:?}",
-            array.shape()
-        ))),
-    }
 }

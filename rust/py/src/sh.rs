@@ -2,11 +2,11 @@
 
 use bigs_raster::{Harmonics, Scalar};
 use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-use crate::convert::{gradient, slice};
+use crate::convert::{contiguous, gradient, rows, slice};
 use crate::run;
 
 /// The arrays of a call, borrowed for as long as this lives.
@@ -19,6 +19,9 @@ struct Arrays<'py, T: Element> {
 impl<'py, T: Scalar + Element> Arrays<'py, T> {
     /// Reads (dirs, coefficients, mask | None).
     fn extract(arrays: &Bound<'py, PyTuple>) -> PyResult<Self> {
+        if arrays.len() != 3 {
+            return Err(PyTypeError::new_err("arrays: expected three entries"));
+        }
         let mask = arrays.get_item(2)?;
         Ok(Self {
             dirs: slice("dirs", &arrays.get_item(0)?)?,
@@ -29,18 +32,22 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
 
     fn harmonics(&self, degree: usize) -> PyResult<Harmonics<'_, T>> {
         let shape = self.coefficients.shape();
-        if shape.len() < 2 {
+        if shape.len() < 2 || shape[shape.len() - 1] != 3 {
             return Err(PyValueError::new_err(format!(
-                "coeffs: expected axes for bases and colours, found shape {shape:?}"
+                "coeffs: expected axes for bases and three colours, found shape {shape:?}"
             )));
         }
-        let mask = self.mask.as_ref().map(|mask| mask.as_slice()).transpose()?;
-        let dirs = self.dirs.as_slice()?.as_chunks().0;
+        let mask = self
+            .mask
+            .as_ref()
+            .map(|mask| contiguous("masks", mask))
+            .transpose()?;
+        let dirs = rows("dirs", &self.dirs)?;
         Harmonics::new(
             degree,
             shape[shape.len() - 2],
             dirs,
-            self.coefficients.as_slice()?,
+            contiguous("coeffs", &self.coefficients)?,
             mask,
         )
         .map_err(crate::value_error)
@@ -80,7 +87,7 @@ fn backward<'py, T: Scalar + Element>(
 ) -> PyResult<Bound<'py, PyTuple>> {
     let harmonics = arrays.harmonics(degree)?;
     let v_colors = slice::<T>("v_colors", v_colors)?;
-    let v_colors = v_colors.as_slice()?.as_chunks().0;
+    let v_colors = rows("v_colors", &v_colors)?;
     let gradients = run(py, || harmonics.vjp(v_colors, dirs, coefficients))?;
     (
         gradient(py, gradients.dirs.into_flattened()),

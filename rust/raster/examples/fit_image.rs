@@ -1,6 +1,6 @@
 //! Fits Gaussians to a picture by gradient descent: `cargo run --release --example fit_image -- photo.png`.
 //!
-//! The whole loop of a differentiable renderer in one file: activations, render, loss, `render_vjp`, Adam. Without a
+//! The whole loop of a differentiable renderer in one file: activations, render, loss, `Frame::vjp`, Adam. Without a
 //! file it fits a built-in picture. `--help` lists the options.
 
 #[path = "support/photo.rs"]
@@ -230,7 +230,7 @@ fn fit(target: &Picture, options: &Options) -> Result<(Picture, f64), Box<dyn Er
             return Ok((Picture { width, height, rgb }, quality));
         }
 
-        let mut v = renderer.render_vjp(&gaussians, &camera, None, &frame, &v_colors, &v_alphas)?;
+        let mut v = frame.vjp(&gaussians, &v_colors, &v_alphas)?;
         // From what the renderer takes to what is optimised.
         for (v, s) in v.scales.as_flattened_mut().iter_mut().zip(scales.as_flattened()) {
             *v *= s;

@@ -4,6 +4,7 @@ use std::fmt;
 
 /// An input that cannot be rendered; the message names the input, what was expected and what was found.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum RasterError {
     /// An array has the wrong number of elements.
     LengthMismatch {
@@ -13,6 +14,22 @@ pub enum RasterError {
         expected: usize,
         /// Elements found.
         got: usize,
+    },
+    /// A size is out of its range, or sizes multiply to more than can be numbered.
+    BadSize {
+        /// Which size.
+        name: &'static str,
+        /// What is accepted.
+        expected: &'static str,
+        /// What was found, as far as it can be numbered.
+        got: usize,
+    },
+    /// The memory for a result cannot be had.
+    OutOfMemory {
+        /// Which array.
+        name: &'static str,
+        /// Elements it would have.
+        elements: usize,
     },
     /// A value is NaN or infinite.
     NotFinite {
@@ -56,6 +73,15 @@ impl fmt::Display for RasterError {
         match self {
             Self::LengthMismatch { name, expected, got } => {
                 write!(f, "{name}: expected {expected} elements, found {got}")
+            }
+            Self::BadSize { name, expected, got } => {
+                write!(f, "{name}: expected {expected}, found {got}")
+            }
+            Self::OutOfMemory { name, elements } => {
+                write!(
+                    f,
+                    "{name}: expected memory for {elements} elements, found too little"
+                )
             }
             Self::NotFinite { name, index } => {
                 write!(

@@ -15,14 +15,15 @@
 //!     &[1.0, 0.0, 0.0],
 //!     3,
 //! )?;
-//! let world_from_camera_is_identity = [
+//! // A camera at the origin that looks along z. Rows of the world-to-camera matrix: here, the identity.
+//! let viewmat = [
 //!     [1.0, 0.0, 0.0, 0.0],
 //!     [0.0, 1.0, 0.0, 0.0],
 //!     [0.0, 0.0, 1.0, 0.0],
 //!     [0.0, 0.0, 0.0, 1.0],
 //! ];
 //! let k = Intrinsics { fx: 60.0, fy: 60.0, cx: 16.5, cy: 16.5 };
-//! let camera = Camera::new(world_from_camera_is_identity, k, 33, 33)?;
+//! let camera = Camera::new(viewmat, k, 33, 33)?;
 //!
 //! let renderer = Renderer::<f32>::new(&RasterSettings::default(), RenderMode::Rgb)?;
 //! let frame = renderer.render(&gaussians, &camera, None)?;
@@ -31,15 +32,15 @@
 //!
 //! // The loss is the red of all pixels; a wider Gaussian is a redder image.
 //! let v_colors: Vec<f32> = (0..33 * 33).flat_map(|_| [1.0, 0.0, 0.0]).collect();
-//! let grads = renderer.render_vjp(&gaussians, &camera, None, &frame, &v_colors, &vec![0.0; 33 * 33])?;
+//! let grads = frame.vjp(&gaussians, &v_colors, &vec![0.0; 33 * 33])?;
 //! assert!(grads.scales[0][0] > 0.0 && grads.opacities[0] > 0.0);
 //! # Ok::<(), bigs_raster::RasterError>(())
 //! ```
 //!
 //! # Gradients
 //!
-//! [`Renderer::render_vjp`] takes what [`Renderer::render`] took, the frame it made, and the gradients of a loss with
-//! respect to the frame's colours and alphas; it returns those with respect to every input ([`GaussianGrads`]). They
+//! [`Frame::vjp`] takes the gradients of a loss with respect to the frame's colours and alphas, and the Gaussians that the
+//! frame shows; it returns the gradients with respect to every input of [`Renderer::render`] ([`GaussianGrads`]). They
 //! are those of the formulas: a pair of pixel and Gaussian that is clamped, below the alpha threshold or behind the
 //! point where a pixel stops passes none. `examples/fit_image.rs` is a whole optimisation.
 //!
@@ -76,13 +77,14 @@
 //! # CPU features
 //!
 //! Kernels for AVX-512, AVX2 with FMA, NEON and the baseline of the target are compiled in, whatever the flags of the
-//! build; the best that the CPU has is picked on first use. [`peak::simd_level`] tells which. The environment variable
-//! `BIGS_RASTER_SIMD` (`avx512`, `avx2`, `neon`, `baseline`) lowers the choice.
+//! build; the best that the CPU has is picked on first use. [`simd_level`] tells which. The environment variable
+//! `BIGS_RASTER_SIMD` lowers the choice to another of [`simd_levels`]; any other name is an error.
 //!
 //! # Errors
 //!
 //! What a caller can get wrong is a [`RasterError`] that names the input and what was expected. Arrays are checked once,
-//! in [`Gaussians::new`], [`Camera::new`] and [`Batch::new`]; nothing panics on their values.
+//! in [`Gaussians::new`], [`Camera::new`] and [`Batch::new`]; nothing panics on their values. What a [`Frame`] or
+//! [`BatchState`] was rendered with it keeps, so that its gradients cannot be asked for with another camera or background.
 
 #![deny(unsafe_code)]
 // A caller's mistake is an error, never a panic. Tests may unwrap.
@@ -112,22 +114,27 @@ mod project;
 mod simd;
 
 pub use api::batch::{Batch, BatchImages, BatchState, Counters};
-pub use api::batch_inputs::{BatchInputs, BatchShape, Slabs};
+pub use api::batch_inputs::{BatchInputs, BatchShape, GaussianSlabs, Slabs};
 pub use api::batch_vjp::{BatchGradients, Wanted};
 pub use api::harmonics::Harmonics;
 pub use api::renderer::{Frame, GaussianGrads, Renderer};
+#[doc(hidden)]
 pub use api::stages;
 pub use color::harmonics::HarmonicsGradients;
 pub use error::RasterError;
 pub use input::camera::{Camera, CameraModel, Intrinsics};
 pub use input::gaussians::Gaussians;
 pub use input::settings::{RasterSettings, RenderMode};
+#[doc(hidden)]
 pub use lists::radix_sort::radix_sort;
+#[doc(hidden)]
 pub use math::radix_key::RadixKey;
 pub use math::real::Real;
 pub use memory::pool::release_memory;
 pub use pipeline::scalar::Scalar;
+#[doc(hidden)]
 pub use simd::peak;
+pub use simd::peak::{simd_level, simd_levels};
 
 /// The README's code is compiled and run with the documentation's.
 #[cfg(doctest)]

@@ -55,9 +55,7 @@ fn render_scene(
     let v_alphas: Vec<f32> = (0..frame.alphas.len())
         .map(|i| f32::from(u8::from(i > half)))
         .collect();
-    let grads = renderer
-        .render_vjp(&scene.view(), camera, None, &frame, &v_colors, &v_alphas)
-        .unwrap();
+    let grads = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
     (frame, grads)
 }
 

@@ -180,16 +180,7 @@ fn gradients_are_finite_differences() {
         let frame = renderer
             .render(&scene.view(), &camera, Some(&background))
             .unwrap();
-        let grads = renderer
-            .render_vjp(
-                &scene.view(),
-                &camera,
-                Some(&background),
-                &frame,
-                &v_colors,
-                &v_alphas,
-            )
-            .unwrap();
+        let grads = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
         let grads = flat(&grads);
         let h = 1e-5;
         for (at, &gradient) in grads.iter().enumerate() {
@@ -210,7 +201,7 @@ fn gradients_are_finite_differences() {
 /// Runs this file's other tests again with the kernels of lesser CPUs.
 #[test]
 fn every_cpu_level_passes() {
-    for level in ["avx512", "avx2", "neon", "baseline"] {
+    for level in bigs_raster::simd_levels() {
         let run = std::process::Command::new(std::env::current_exe().unwrap())
             .args(["images_match", "single_precision", "depth_is", "gradients_are"])
             .env("BIGS_RASTER_SIMD", level)
@@ -260,9 +251,7 @@ fn gradients_on_screen_are_those_of_moving_the_image() {
     };
     let camera = shifted([0.0; 2]);
     let frame = renderer.render(&scene.view(), &camera, None).unwrap();
-    let grads = renderer
-        .render_vjp(&scene.view(), &camera, None, &frame, &v_colors, &v_alphas)
-        .unwrap();
+    let grads = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
     let h = 1e-5;
     for (axis, step) in [(0, [h, 0.0]), (1, [0.0, h])] {
         let expected = (loss(step) - loss(step.map(|s: f64| -s))) / (2.0 * h);
@@ -283,11 +272,7 @@ fn absolute_gradients_are_those_of_single_pixels() {
     let mut r = Random::new(5);
     let v_colors: Vec<f64> = (0..width * height * 3).map(|_| r.uniform(-1.0, 1.0)).collect();
     let v_alphas = vec![0.0; width * height];
-    let gradients = |v_colors: &[f64]| {
-        renderer
-            .render_vjp(&scene.view(), &camera, None, &frame, v_colors, &v_alphas)
-            .unwrap()
-    };
+    let gradients = |v_colors: &[f64]| frame.vjp(&scene.view(), v_colors, &v_alphas).unwrap();
     let mut sums = vec![0.0; 2 * 30];
     for pixel in 0..width * height {
         let mut alone = vec![0.0; v_colors.len()];
@@ -300,9 +285,8 @@ fn absolute_gradients_are_those_of_single_pixels() {
     let together = gradients(&v_colors);
     assert!(relative(together.absgrad.as_flattened(), &sums) < 1e-12);
     let plain = Renderer::<f64>::new(&RasterSettings::default(), RenderMode::Rgb).unwrap();
-    let without = plain
-        .render_vjp(&scene.view(), &camera, None, &frame, &v_colors, &v_alphas)
-        .unwrap();
+    let frame = plain.render(&scene.view(), &camera, None).unwrap();
+    let without = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
     assert!(without.absgrad.is_empty());
     assert!(relative(together.means.as_flattened(), without.means.as_flattened()) < 1e-12);
 }

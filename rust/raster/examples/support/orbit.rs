@@ -82,9 +82,10 @@ impl Orbit {
         };
         let viewmat = [row(right), row(down), row(forward), [0.0, 0.0, 0.0, 1.0]];
         let focal = height as f32 / 2.0 / (fov.to_radians() / 2.0).tan();
-        let scale = match model {
-            CameraModel::Pinhole => focal,
-            CameraModel::Orthographic => focal / self.distance,
+        let scale = if model == CameraModel::Orthographic {
+            focal / self.distance
+        } else {
+            focal
         };
         let k = Intrinsics {
             fx: scale,

@@ -2,11 +2,12 @@
 
 use rayon::prelude::*;
 
-use crate::api::batch_inputs::{BatchInputs, BatchShape};
+use crate::api::batch_inputs::{BatchInputs, BatchShape, Layout};
 use crate::error::RasterError;
 use crate::input::camera::{Camera, Intrinsics};
-use crate::input::gaussians::{Gaussians, check_finite};
+use crate::input::gaussians::check_finite;
 use crate::input::settings::{Limits, RasterSettings, RenderMode};
+use crate::memory::results::filled_with;
 use crate::pipeline::scalar::Scalar;
 use crate::pipeline::view::{Image, View, ViewState, render_view};
 use crate::project::splat::ScreenInfo;
@@ -14,15 +15,16 @@ use crate::project::splat::ScreenInfo;
 /// A checked batch.
 #[derive(Debug)]
 pub struct Batch<'a, T> {
-    pub(crate) shape: BatchShape,
-    pub(crate) inputs: BatchInputs<'a, T>,
+    shape: BatchShape,
+    inputs: BatchInputs<'a, T>,
     cameras: Vec<Camera<T>>,
-    pub(crate) limits: Limits<T>,
-    pub(crate) mode: RenderMode,
+    limits: Limits<T>,
+    mode: RenderMode,
 }
 
 /// Images of a batch, one after the other, and what is known of each Gaussian in each view.
 #[derive(Debug)]
+#[non_exhaustive]
 pub struct BatchImages<T> {
     /// Views, rows, columns, channels.
     pub colors: Vec<T>,
@@ -37,13 +39,20 @@ pub struct BatchImages<T> {
 }
 
 /// What the forward pass of a batch keeps for the backward pass.
+///
+/// It owns the cameras, mode, settings, backgrounds and mask of its batch; [`BatchState::vjp`] asks for the Gaussians only.
 #[derive(Debug)]
 pub struct BatchState<T: Scalar> {
+    pub(crate) shape: BatchShape,
+    pub(crate) mode: RenderMode,
+    pub(crate) viewmats: Layout,
+    pub(crate) backgrounds: Option<Layout>,
     pub(crate) views: Vec<ViewState<T>>,
 }
 
 /// Work done and skipped, summed over the views.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Counters {
     /// (Gaussian, tile) intersections.
     pub intersections: usize,
@@ -76,17 +85,6 @@ impl<T: Scalar> BatchState<T> {
     }
 }
 
-/// Whether the values of a batch's inputs are known to be finite.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Values {
-    Checked,
-    Unchecked,
-}
-
-fn rows<const N: usize, T>(slab: &[T]) -> &[[T; N]] {
-    slab.as_chunks().0
-}
-
 impl<'a, T: Scalar> Batch<'a, T> {
     /// Checks everything that rendering relies on.
     ///
@@ -98,49 +96,17 @@ impl<'a, T: Scalar> Batch<'a, T> {
         settings: &RasterSettings,
         mode: RenderMode,
     ) -> Result<Self, RasterError> {
-        Self::checked(shape, inputs, settings, mode, Values::Unchecked)
-    }
-
-    /// The same for inputs whose values have passed [`Batch::new`] before, as those of a backward pass have.
-    ///
-    /// # Errors
-    /// As [`Batch::new`], but values are not scanned.
-    pub fn new_trusted(
-        shape: BatchShape,
-        inputs: BatchInputs<'a, T>,
-        settings: &RasterSettings,
-        mode: RenderMode,
-    ) -> Result<Self, RasterError> {
-        Self::checked(shape, inputs, settings, mode, Values::Checked)
-    }
-
-    fn checked(
-        shape: BatchShape,
-        inputs: BatchInputs<'a, T>,
-        settings: &RasterSettings,
-        mode: RenderMode,
-        values: Values,
-    ) -> Result<Self, RasterError> {
+        shape.check(mode)?;
         let limits = Limits::new(settings)?;
-        let n = shape.gaussians;
-        let arrays = [
-            ("means", inputs.means, 3 * n),
-            ("quats", inputs.quats, 4 * n),
-            ("scales", inputs.scales, 3 * n),
-            ("opacities", inputs.opacities, n),
-            ("colors", inputs.colors, shape.channels * n),
-            ("viewmats", inputs.viewmats, 16),
-            ("Ks", inputs.ks, 9),
-        ];
-        for (name, slabs, elements) in arrays.into_iter().chain(
-            inputs
-                .backgrounds
-                .map(|slabs| ("backgrounds", slabs, shape.channels)),
-        ) {
+        inputs.gaussians.check_lengths(&shape)?;
+        inputs.gaussians.check_values(&shape)?;
+        let arrays = [("viewmats", inputs.viewmats, 16), ("Ks", inputs.ks, 9)];
+        let backgrounds = inputs
+            .backgrounds
+            .map(|slabs| ("backgrounds", slabs, shape.channels));
+        for (name, slabs, elements) in arrays.into_iter().chain(backgrounds) {
             slabs.check(name, &shape, elements)?;
-            if values == Values::Unchecked {
-                check_finite(name, slabs.data)?;
-            }
+            check_finite(name, slabs.data)?;
         }
         if let Some(mask) = inputs.pixel_mask {
             mask.check("pixel_mask", &shape, shape.pixels())?;
@@ -160,7 +126,7 @@ impl<'a, T: Scalar> Batch<'a, T> {
                     cx: k[2],
                     cy: k[5],
                 };
-                let rows = rows::<4, T>(viewmat);
+                let rows: &[[T; 4]] = viewmat.as_chunks().0;
                 Camera::new(
                     [rows[0], rows[1], rows[2], rows[3]],
                     intrinsics,
@@ -179,17 +145,10 @@ impl<'a, T: Scalar> Batch<'a, T> {
         })
     }
 
-    pub(crate) fn view(&self, view: usize) -> View<'a, T> {
+    fn view(&self, view: usize) -> View<'a, T> {
         let cameras = self.shape.cameras;
         View {
-            gaussians: Gaussians {
-                means: rows(self.inputs.means.slab(view, cameras)),
-                quats: rows(self.inputs.quats.slab(view, cameras)),
-                scales: rows(self.inputs.scales.slab(view, cameras)),
-                opacities: self.inputs.opacities.slab(view, cameras),
-                colors: self.inputs.colors.slab(view, cameras),
-                channels: self.shape.channels,
-            },
+            gaussians: self.inputs.gaussians.of_view(view, &self.shape),
             camera: self.cameras[view],
             background: self.inputs.backgrounds.map(|slabs| slabs.slab(view, cameras)),
             pixel_mask: self.inputs.pixel_mask.map(|slabs| slabs.slab(view, cameras)),
@@ -199,16 +158,16 @@ impl<'a, T: Scalar> Batch<'a, T> {
     /// Renders every view.
     ///
     /// # Errors
-    /// [`RasterError::TooManyIntersections`].
+    /// [`RasterError::TooManyIntersections`], [`RasterError::OutOfMemory`].
     pub fn render(&self) -> Result<(BatchImages<T>, BatchState<T>), RasterError> {
         let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
         let total = self.shape.image_channels(self.mode);
         let mut images = BatchImages {
-            colors: vec![T::ZERO; views * pixels * total],
-            alphas: vec![T::ZERO; views * pixels],
-            means2d: vec![[T::ZERO; 2]; views * n],
-            depths: vec![T::ZERO; views * n],
-            radii: vec![[0; 2]; views * n],
+            colors: filled_with("images", T::ZERO, &[views, pixels, total])?,
+            alphas: filled_with("images", T::ZERO, &[views, pixels])?,
+            means2d: filled_with("means2d", [T::ZERO; 2], &[views, n])?,
+            depths: filled_with("depths", T::ZERO, &[views, n])?,
+            radii: filled_with("radii", [0; 2], &[views, n])?,
         };
         let states = (
             split(&mut images.colors, views),
@@ -232,7 +191,14 @@ impl<'a, T: Scalar> Batch<'a, T> {
                 render_view(&self.view(view), self.mode, &self.limits, image)
             })
             .collect::<Result<Vec<_>, _>>()?;
-        Ok((images, BatchState { views: states }))
+        let state = BatchState {
+            shape: self.shape,
+            mode: self.mode,
+            viewmats: self.inputs.viewmats.layout(),
+            backgrounds: self.inputs.backgrounds.map(|slabs| slabs.layout()),
+            views: states,
+        };
+        Ok((images, state))
     }
 }
 

@@ -1,9 +1,33 @@
 //! What a batch of views is made of, and what its views share.
 
 use crate::error::RasterError;
-use crate::input::camera::CameraModel;
-use crate::input::gaussians::check_length;
+use crate::input::camera::{CameraModel, check_size};
+use crate::input::gaussians::{Gaussians, check_channels, check_counts, check_finite, check_length};
 use crate::input::settings::RenderMode;
+use crate::math::real::Real;
+use crate::memory::results::product;
+
+/// Images of a batch at most: shared inputs let a batch of any size fit into little memory.
+const MAX_VIEWS: usize = 1 << 20;
+
+/// How many slabs an input has along each axis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Layout {
+    entries: usize,
+    cameras: usize,
+}
+
+impl Layout {
+    pub(crate) fn count(self) -> usize {
+        self.entries * self.cameras
+    }
+
+    /// Which slab a view uses.
+    pub(crate) fn index(self, view: usize, cameras: usize) -> usize {
+        let (entry, camera) = (view / cameras, view % cameras);
+        (if self.entries > 1 { entry } else { 0 }) * self.cameras + if self.cameras > 1 { camera } else { 0 }
+    }
+}
 
 /// An input of a batch: `entries` × `cameras` slabs, where 1 along either axis means "shared".
 #[derive(Clone, Copy, Debug)]
@@ -18,18 +42,19 @@ pub struct Slabs<'a, U> {
 
 impl<'a, U> Slabs<'a, U> {
     pub(crate) fn count(&self) -> usize {
-        self.entries * self.cameras
+        self.layout().count()
     }
 
-    /// Which slab a view uses.
-    pub(crate) fn index(&self, view: usize, cameras: usize) -> usize {
-        let (entry, camera) = (view / cameras, view % cameras);
-        (if self.entries > 1 { entry } else { 0 }) * self.cameras + if self.cameras > 1 { camera } else { 0 }
+    pub(crate) fn layout(&self) -> Layout {
+        Layout {
+            entries: self.entries,
+            cameras: self.cameras,
+        }
     }
 
     pub(crate) fn slab(&self, view: usize, cameras: usize) -> &'a [U] {
         let size = self.data.len() / self.count();
-        &self.data[self.index(view, cameras) * size..][..size]
+        &self.data[self.layout().index(view, cameras) * size..][..size]
     }
 
     pub(crate) fn check(
@@ -45,7 +70,11 @@ impl<'a, U> Slabs<'a, U> {
         if !fits(self.cameras, shape.cameras) {
             return check_length(name, shape.cameras, self.cameras);
         }
-        check_length(name, self.count() * elements, self.data.len())
+        check_length(
+            name,
+            product(&[self.entries, self.cameras, elements]),
+            self.data.len(),
+        )
     }
 }
 
@@ -69,22 +98,51 @@ pub struct BatchShape {
 impl BatchShape {
     /// Images in the batch.
     pub fn views(&self) -> usize {
-        self.entries * self.cameras
+        product(&[self.entries, self.cameras])
     }
 
     pub(crate) fn pixels(&self) -> usize {
-        self.width * self.height
+        product(&[self.width, self.height])
     }
 
     /// Channels of an image in this mode.
     pub fn image_channels(&self, mode: RenderMode) -> usize {
-        (if mode.has_colors() { self.channels } else { 0 }) + usize::from(mode.has_depth())
+        mode.channels(self.channels)
+    }
+
+    /// Whether everything that a batch of these sizes counts can be numbered, so that no product below overflows.
+    pub(crate) fn check(&self, mode: RenderMode) -> Result<(), RasterError> {
+        check_counts(self.gaussians, self.channels)?;
+        check_channels(mode, self.channels)?;
+        check_size(self.width, self.height)?;
+        let views = self.views();
+        if views > MAX_VIEWS {
+            return Err(RasterError::BadSize {
+                name: "batch",
+                expected: "at most 2^20 images",
+                got: views,
+            });
+        }
+        // Bytes of the widest arrays: `f64` images, and four numbers or colours per Gaussian.
+        let numbers = [self.image_channels(mode), self.channels, 16]
+            .into_iter()
+            .max()
+            .unwrap_or(16);
+        let largest = product(&[views, 8, numbers, self.pixels().max(self.gaussians)]);
+        if largest > isize::MAX as usize {
+            return Err(RasterError::BadSize {
+                name: "batch",
+                expected: "entries and cameras whose images fit into the address space",
+                got: views,
+            });
+        }
+        Ok(())
     }
 }
 
-/// The inputs of a batch. Slabs of Gaussians have one row per Gaussian, `viewmats` 4×4 row-major matrices, `ks` 3×3.
+/// The Gaussians of a batch, one row each in every slab.
 #[derive(Clone, Copy, Debug)]
-pub struct BatchInputs<'a, T> {
+pub struct GaussianSlabs<'a, T> {
     /// Centres, 3 per Gaussian.
     pub means: Slabs<'a, T>,
     /// Rotations w x y z, 4 per Gaussian.
@@ -95,6 +153,56 @@ pub struct BatchInputs<'a, T> {
     pub opacities: Slabs<'a, T>,
     /// Colours, `channels` per Gaussian.
     pub colors: Slabs<'a, T>,
+}
+
+impl<'a, T: Real> GaussianSlabs<'a, T> {
+    /// Each array with its name and its values per slab.
+    pub(crate) fn arrays(&self, shape: &BatchShape) -> [(&'static str, Slabs<'a, T>, usize); 5] {
+        let n = shape.gaussians;
+        [
+            ("means", self.means, 3 * n),
+            ("quats", self.quats, 4 * n),
+            ("scales", self.scales, 3 * n),
+            ("opacities", self.opacities, n),
+            ("colors", self.colors, shape.channels * n),
+        ]
+    }
+
+    /// Whether every array has the length that the shape asks for.
+    pub(crate) fn check_lengths(&self, shape: &BatchShape) -> Result<(), RasterError> {
+        for (name, slabs, elements) in self.arrays(shape) {
+            slabs.check(name, shape, elements)?;
+        }
+        Ok(())
+    }
+
+    /// Whether every value is finite.
+    pub(crate) fn check_values(&self, shape: &BatchShape) -> Result<(), RasterError> {
+        for (name, slabs, _) in self.arrays(shape) {
+            check_finite(name, slabs.data)?;
+        }
+        Ok(())
+    }
+
+    /// Those of a view.
+    pub(crate) fn of_view(&self, view: usize, shape: &BatchShape) -> Gaussians<'a, T> {
+        let cameras = shape.cameras;
+        Gaussians {
+            means: self.means.slab(view, cameras).as_chunks().0,
+            quats: self.quats.slab(view, cameras).as_chunks().0,
+            scales: self.scales.slab(view, cameras).as_chunks().0,
+            opacities: self.opacities.slab(view, cameras),
+            colors: self.colors.slab(view, cameras),
+            channels: shape.channels,
+        }
+    }
+}
+
+/// The inputs of a batch. `viewmats` are 4×4 row-major matrices, `ks` 3×3.
+#[derive(Clone, Copy, Debug)]
+pub struct BatchInputs<'a, T> {
+    /// What is rendered.
+    pub gaussians: GaussianSlabs<'a, T>,
     /// World-to-camera matrices.
     pub viewmats: Slabs<'a, T>,
     /// Camera matrices.

@@ -2,18 +2,18 @@
 
 use rayon::prelude::*;
 
-use crate::api::batch::{Batch, BatchState, split};
-use crate::api::batch_inputs::Slabs;
+use crate::api::batch::{BatchState, split};
+use crate::api::batch_inputs::{GaussianSlabs, Layout};
 use crate::backproject::gradients::ViewGradients;
 use crate::composite::backward::Cotangents;
 use crate::error::RasterError;
 use crate::input::gaussians::check_length;
 use crate::memory::pool::{Buffers, Pooled, bytes_of};
+use crate::memory::results::filled_with;
 use crate::pipeline::scalar::Scalar;
-use crate::pipeline::view::render_view_vjp;
 
-/// Which gradients are asked for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Which gradients are asked for; none by default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub struct Wanted {
     pub means: bool,
@@ -32,6 +32,7 @@ pub struct Wanted {
 /// Gradients of a batch's inputs, each in the layout of its input; empty if not asked for. A shared input has the sum
 /// over the views that share it, in order.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 #[allow(missing_docs)]
 pub struct BatchGradients<T> {
     pub means: Vec<T>,
@@ -74,19 +75,36 @@ fn rows_mut<const N: usize, T>(slab: &mut [T]) -> &mut [[T; N]] {
     slab.as_chunks_mut().0
 }
 
-impl<T: Scalar> Batch<'_, T> {
-    /// Gradients of a loss, given its gradients with respect to the colours and alphas of [`Batch::render`]; `None`
-    /// stands for zeros.
+impl<T: Scalar> BatchState<T> {
+    /// Gradients of a loss, given its gradients with respect to the colours and alphas of the images, `None` standing for
+    /// zeros, and the Gaussians that were rendered.
     ///
     /// # Errors
-    /// Gradients whose length is not that of the images.
-    pub fn render_vjp(
+    /// Gaussians that do not fit the batch or are not finite, gradients whose length is not that of the images,
+    /// [`RasterError::OutOfMemory`].
+    pub fn vjp(
         &self,
-        state: &BatchState<T>,
+        gaussians: &GaussianSlabs<'_, T>,
         v_colors: Option<&[T]>,
         v_alphas: Option<&[T]>,
         wanted: Wanted,
     ) -> Result<BatchGradients<T>, RasterError> {
+        gaussians.check_values(&self.shape)?;
+        self.vjp_of_rendered(gaussians, v_colors, v_alphas, wanted)
+    }
+
+    /// [`BatchState::vjp`] for values that are known to be finite, as those are that were rendered and not changed since.
+    ///
+    /// # Errors
+    /// As [`BatchState::vjp`], but values are not scanned: NaN gives NaN.
+    pub fn vjp_of_rendered(
+        &self,
+        gaussians: &GaussianSlabs<'_, T>,
+        v_colors: Option<&[T]>,
+        v_alphas: Option<&[T]>,
+        wanted: Wanted,
+    ) -> Result<BatchGradients<T>, RasterError> {
+        gaussians.check_lengths(&self.shape)?;
         let (views, n, pixels) = (self.shape.views(), self.shape.gaussians, self.shape.pixels());
         let total = self.shape.image_channels(self.mode);
         let mut zeros = Pooled::<Zeros<T>>::take();
@@ -102,16 +120,18 @@ impl<T: Scalar> Batch<'_, T> {
         check_length("v_alphas", views * pixels, v_alphas.len())?;
 
         // One slab per view, summed where views share an input.
-        let buffer = |wanted: bool, size: usize| vec![T::ZERO; if wanted { views * size } else { 0 }];
-        let mut means = buffer(wanted.means, 3 * n);
-        let mut quats = buffer(wanted.quats, 4 * n);
-        let mut scales = buffer(wanted.scales, 3 * n);
-        let mut opacities = buffer(wanted.opacities, n);
-        let mut colors = buffer(wanted.colors, self.shape.channels * n);
-        let mut viewmats = buffer(wanted.viewmats, 12);
-        let mut backgrounds = buffer(wanted.backgrounds, self.shape.channels);
-        let mut means2d = buffer(wanted.means2d, 2 * n);
-        let mut absgrad = buffer(wanted.absgrad, 2 * n);
+        let buffer = |name: &'static str, wanted: bool, size: usize| {
+            filled_with(name, T::ZERO, &[if wanted { views } else { 0 }, size])
+        };
+        let mut means = buffer("means", wanted.means, 3 * n)?;
+        let mut quats = buffer("quats", wanted.quats, 4 * n)?;
+        let mut scales = buffer("scales", wanted.scales, 3 * n)?;
+        let mut opacities = buffer("opacities", wanted.opacities, n)?;
+        let mut colors = buffer("colors", wanted.colors, self.shape.channels * n)?;
+        let mut viewmats = buffer("viewmats", wanted.viewmats, 12)?;
+        let mut backgrounds = buffer("backgrounds", wanted.backgrounds, self.shape.channels)?;
+        let mut means2d = buffer("means2d", wanted.means2d, 2 * n)?;
+        let mut absgrad = buffer("absgrad", wanted.absgrad, 2 * n)?;
         let geometry = (
             split(&mut means, views),
             split(&mut quats, views),
@@ -149,21 +169,19 @@ impl<T: Scalar> Batch<'_, T> {
                         detach_means2d: wanted.detach_means2d,
                         absgrad: rows_mut(absgrad),
                     };
-                    let state = &state.views[view];
-                    render_view_vjp(&self.view(view), self.mode, &self.limits, state, v, out)
+                    self.views[view].vjp(&gaussians.of_view(view, &self.shape), v, out)
                 },
             )
-            .sum();
-        let inputs = &self.inputs;
+            .sum::<Result<usize, RasterError>>()?;
         Ok(BatchGradients {
-            means: self.shared(means, &inputs.means),
-            quats: self.shared(quats, &inputs.quats),
-            scales: self.shared(scales, &inputs.scales),
-            opacities: self.shared(opacities, &inputs.opacities),
-            colors: self.shared(colors, &inputs.colors),
-            viewmats: self.shared(viewmats, &inputs.viewmats),
-            backgrounds: match &inputs.backgrounds {
-                Some(slabs) => self.shared(backgrounds, slabs),
+            means: self.shared(means, gaussians.means.layout())?,
+            quats: self.shared(quats, gaussians.quats.layout())?,
+            scales: self.shared(scales, gaussians.scales.layout())?,
+            opacities: self.shared(opacities, gaussians.opacities.layout())?,
+            colors: self.shared(colors, gaussians.colors.layout())?,
+            viewmats: self.shared(viewmats, self.viewmats)?,
+            backgrounds: match self.backgrounds {
+                Some(layout) => self.shared(backgrounds, layout)?,
                 None => backgrounds,
             },
             means2d,
@@ -173,20 +191,20 @@ impl<T: Scalar> Batch<'_, T> {
     }
 
     /// Sums gradients per view into gradients per slab, views in order.
-    fn shared(&self, per_view: Vec<T>, slabs: &Slabs<'_, T>) -> Vec<T> {
+    fn shared(&self, per_view: Vec<T>, layout: Layout) -> Result<Vec<T>, RasterError> {
         /// Elements summed by one task.
         const PART: usize = 4096;
         let views = self.shape.views();
-        if slabs.count() == views || per_view.is_empty() {
-            return per_view;
+        if layout.count() == views || per_view.is_empty() {
+            return Ok(per_view);
         }
         let size = per_view.len() / views;
-        let mut sums = vec![T::ZERO; slabs.count() * size];
+        let mut sums = filled_with("gradients", T::ZERO, &[layout.count(), size])?;
         for (index, slab) in sums.chunks_exact_mut(size).enumerate() {
             let sharing: Vec<&[T]> = per_view
                 .chunks_exact(size)
                 .enumerate()
-                .filter(|&(view, _)| slabs.index(view, self.shape.cameras) == index)
+                .filter(|&(view, _)| layout.index(view, self.shape.cameras) == index)
                 .map(|(_, values)| values)
                 .collect();
             slab.par_chunks_mut(PART).enumerate().for_each(|(part, sums)| {
@@ -197,6 +215,6 @@ impl<T: Scalar> Batch<'_, T> {
                 }
             });
         }
-        sums
+        Ok(sums)
     }
 }

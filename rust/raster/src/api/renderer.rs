@@ -4,14 +4,16 @@ use crate::backproject::gradients::ViewGradients;
 use crate::composite::backward::Cotangents;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
-use crate::input::gaussians::{Gaussians, check_finite, check_length};
+use crate::input::gaussians::{Gaussians, check_channels, check_finite, check_length};
 use crate::input::settings::{Limits, RasterSettings, RenderMode};
+use crate::memory::results::filled_with;
 use crate::pipeline::scalar::Scalar;
-use crate::pipeline::view::{Image, View, ViewState, channels_of, render_view, render_view_vjp};
+use crate::pipeline::view::{Image, View, ViewState, render_view};
 use crate::project::splat::ScreenInfo;
 
-/// A rendered image.
+/// A rendered image, and what its gradients are computed from: camera, mode, settings, background and scratch memory.
 #[derive(Debug)]
+#[non_exhaustive]
 pub struct Frame<T: Scalar> {
     /// Rows, columns, channels: the colours, then depth if the mode has it.
     pub colors: Vec<T>,
@@ -23,6 +25,7 @@ pub struct Frame<T: Scalar> {
     pub depths: Vec<T>,
     /// Half the extent on screen in pixels, along x and y; zero for a Gaussian that no pixel sees.
     pub radii: Vec<[i32; 2]>,
+    absgrad: bool,
     state: ViewState<T>,
 }
 
@@ -34,10 +37,33 @@ impl<T: Scalar> Frame<T> {
     pub fn median_ids(&self) -> Vec<i32> {
         self.state.median_ids()
     }
+
+    /// Gradients of a loss with respect to all inputs of [`Renderer::render`], given its gradients with respect to the
+    /// colours and alphas of this frame, and the Gaussians that it shows. Everything else the frame knows.
+    ///
+    /// A Gaussian of other values than were rendered has a gradient of no meaning.
+    ///
+    /// # Errors
+    /// Another number of Gaussians or channels than were rendered, or gradients whose length is not that of the image.
+    pub fn vjp(
+        &self,
+        gaussians: &Gaussians<'_, T>,
+        v_colors: &[T],
+        v_alphas: &[T],
+    ) -> Result<GaussianGrads<T>, RasterError> {
+        let mut grads = GaussianGrads::zeros(gaussians, self.absgrad)?;
+        let v = Cotangents {
+            colors: v_colors,
+            alphas: v_alphas,
+        };
+        self.state.vjp(gaussians, v, grads.slices())?;
+        Ok(grads)
+    }
 }
 
 /// Gradients of all inputs of a view.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub struct GaussianGrads<T> {
     /// Of the centres.
     pub means: Vec<[T; 3]>,
@@ -60,19 +86,19 @@ pub struct GaussianGrads<T> {
 }
 
 impl<T: Scalar> GaussianGrads<T> {
-    pub(crate) fn zeros(gaussians: &Gaussians<'_, T>, absgrad: bool) -> Self {
+    pub(crate) fn zeros(gaussians: &Gaussians<'_, T>, absgrad: bool) -> Result<Self, RasterError> {
         let n = gaussians.len();
-        Self {
-            means: vec![[T::ZERO; 3]; n],
-            quats: vec![[T::ZERO; 4]; n],
-            scales: vec![[T::ZERO; 3]; n],
-            opacities: vec![T::ZERO; n],
-            colors: vec![T::ZERO; n * gaussians.channels],
+        Ok(Self {
+            means: filled_with("means", [T::ZERO; 3], &[n])?,
+            quats: filled_with("quats", [T::ZERO; 4], &[n])?,
+            scales: filled_with("scales", [T::ZERO; 3], &[n])?,
+            opacities: filled_with("opacities", T::ZERO, &[n])?,
+            colors: filled_with("colors", T::ZERO, &[n, gaussians.channels])?,
             viewmat: [[T::ZERO; 4]; 3],
             background: vec![T::ZERO; gaussians.channels],
-            means2d: vec![[T::ZERO; 2]; n],
-            absgrad: vec![[T::ZERO; 2]; if absgrad { n } else { 0 }],
-        }
+            means2d: filled_with("means2d", [T::ZERO; 2], &[n])?,
+            absgrad: filled_with("absgrad", [T::ZERO; 2], &[if absgrad { n } else { 0 }])?,
+        })
     }
 
     /// Where a view's vjp adds them.
@@ -126,13 +152,15 @@ impl<T: Scalar> Renderer<T> {
     /// Renders Gaussians; `background` has one value per colour channel (black if absent).
     ///
     /// # Errors
-    /// A background of the wrong length or with a value that is not finite.
+    /// A mode with colours for Gaussians without, a background of the wrong length or with a value that is not finite,
+    /// [`RasterError::TooManyIntersections`], [`RasterError::OutOfMemory`].
     pub fn render(
         &self,
         gaussians: &Gaussians<'_, T>,
         camera: &Camera<T>,
         background: Option<&[T]>,
     ) -> Result<Frame<T>, RasterError> {
+        check_channels(self.mode, gaussians.channels)?;
         if let Some(values) = background {
             check_length("backgrounds", gaussians.channels, values.len())?;
             check_finite("backgrounds", values)?;
@@ -144,10 +172,12 @@ impl<T: Scalar> Renderer<T> {
             pixel_mask: None,
         };
         let (n, pixels) = (gaussians.len(), camera.width * camera.height);
-        let total = channels_of(gaussians, self.mode).total;
-        let mut colors = vec![T::ZERO; pixels * total];
-        let mut alphas = vec![T::ZERO; pixels];
-        let (mut means2d, mut depths, mut radii) = (vec![[T::ZERO; 2]; n], vec![T::ZERO; n], vec![[0; 2]; n]);
+        let total = self.mode.channels(gaussians.channels);
+        let mut colors = filled_with("image", T::ZERO, &[pixels, total])?;
+        let mut alphas = filled_with("image", T::ZERO, &[pixels])?;
+        let mut means2d = filled_with("means2d", [T::ZERO; 2], &[n])?;
+        let mut depths = filled_with("depths", T::ZERO, &[n])?;
+        let mut radii = filled_with("radii", [0; 2], &[n])?;
         let image = Image {
             colors: &mut colors,
             alphas: &mut alphas,
@@ -164,38 +194,8 @@ impl<T: Scalar> Renderer<T> {
             means2d,
             depths,
             radii,
+            absgrad: self.absgrad,
             state,
         })
-    }
-
-    /// Gradients of a loss with respect to all inputs of [`Renderer::render`], given its gradients with respect to
-    /// the frame's colours and alphas. Call it with the inputs that made the frame.
-    ///
-    /// # Errors
-    /// Gradients whose length is not that of the frame's arrays.
-    pub fn render_vjp(
-        &self,
-        gaussians: &Gaussians<'_, T>,
-        camera: &Camera<T>,
-        background: Option<&[T]>,
-        frame: &Frame<T>,
-        v_colors: &[T],
-        v_alphas: &[T],
-    ) -> Result<GaussianGrads<T>, RasterError> {
-        check_length("v_colors", frame.colors.len(), v_colors.len())?;
-        check_length("v_alphas", frame.alphas.len(), v_alphas.len())?;
-        let view = View {
-            gaussians: *gaussians,
-            camera: *camera,
-            background,
-            pixel_mask: None,
-        };
-        let mut grads = GaussianGrads::zeros(gaussians, self.absgrad);
-        let v = Cotangents {
-            colors: v_colors,
-            alphas: v_alphas,
-        };
-        render_view_vjp(&view, self.mode, &self.limits, &frame.state, v, grads.slices());
-        Ok(grads)
     }
 }

@@ -7,10 +7,11 @@ use crate::composite::backward::{CompositeGradients, Cotangents};
 use crate::composite::forward::Canvas;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
-use crate::input::gaussians::{Gaussians, check_length};
+use crate::input::gaussians::{Gaussians, check_channels, check_length};
 use crate::input::settings::{Limits, RasterSettings, RenderMode};
 use crate::lists::tile_lists::{ListScratch, TileLists};
 use crate::memory::pool::Pooled;
+use crate::memory::results::filled_with;
 use crate::pipeline::scalar::Scalar;
 use crate::pipeline::view::{View, scene};
 use crate::project::projected::Projected;
@@ -47,6 +48,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
         settings: &RasterSettings,
         mode: RenderMode,
     ) -> Result<Self, RasterError> {
+        check_channels(mode, gaussians.channels)?;
         let limits = Limits::new(settings)?;
         let view = View {
             gaussians: *gaussians,
@@ -56,7 +58,9 @@ impl<'a, T: Scalar> Stages<'a, T> {
         };
         let grid = TileGrid::new(camera.width, camera.height, limits.tile_size);
         let n = gaussians.len();
-        let (mut means2d, mut depths, mut radii) = (vec![[T::ZERO; 2]; n], vec![T::ZERO; n], vec![[0; 2]; n]);
+        let mut means2d = filled_with("means2d", [T::ZERO; 2], &[n])?;
+        let mut depths = filled_with("depths", T::ZERO, &[n])?;
+        let mut radii = filled_with("radii", [0; 2], &[n])?;
         let (mut projected, mut lists, mut scratch) = (Pooled::take(), Pooled::take(), Pooled::take());
         let screen = ScreenInfo {
             means2d: &mut means2d,
@@ -75,8 +79,8 @@ impl<'a, T: Scalar> Stages<'a, T> {
         T::bin(&mut projected, grid.len(), &mut scratch, &mut lists)?;
         let scene = scene(&view, mode, &limits, &projected, &lists);
         let pixels = grid.width * grid.height;
-        let mut colors = vec![T::ZERO; pixels * scene.channels.total];
-        let mut alphas = vec![T::ZERO; pixels];
+        let mut colors = filled_with("image", T::ZERO, &[pixels, scene.channels.total])?;
+        let mut alphas = filled_with("image", T::ZERO, &[pixels])?;
         let canvas = T::composite(&scene, &mut colors, &mut alphas);
         let v = Cotangents {
             colors: &vec![T::ONE; colors.len()],
@@ -156,8 +160,11 @@ impl<'a, T: Scalar> Stages<'a, T> {
     }
 
     /// The vjp of [`Stages::project`], given what the last [`Stages::composite_vjp`] left.
-    pub fn project_vjp(&self) -> GaussianGrads<T> {
-        let mut grads = GaussianGrads::zeros(&self.view.gaussians, false);
+    ///
+    /// # Errors
+    /// [`RasterError::OutOfMemory`].
+    pub fn project_vjp(&self) -> Result<GaussianGrads<T>, RasterError> {
+        let mut grads = GaussianGrads::zeros(&self.view.gaussians, false)?;
         let channels = scene(&self.view, self.mode, &self.limits, &self.projected, &self.lists).channels;
         T::project_vjp(
             &self.view.gaussians,
@@ -169,7 +176,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
             self.gradients.intersections.written(),
             grads.slices(),
         );
-        grads
+        Ok(grads)
     }
 
     /// How many (pixel, Gaussian) pairs the image is made of: alpha reaches the threshold, and the pixel is not spent.

@@ -9,6 +9,8 @@ use crate::math::real::Real;
 
 /// The highest degree.
 const MAX_DEGREE: usize = 3;
+/// The most basis functions that coefficients may be given for.
+const MAX_BASES: usize = 1 << 16;
 
 /// Gaussians handled by one task. Fixed, so that sums do not depend on the number of threads.
 const PACKET_SIZE: usize = 512;
@@ -41,7 +43,7 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
         coefficients: &'a [T],
         mask: Option<&'a [bool]>,
     ) -> Result<Self, RasterError> {
-        if degree > MAX_DEGREE || (degree + 1) * (degree + 1) > bases {
+        if degree > MAX_DEGREE || (degree + 1) * (degree + 1) > bases || bases > MAX_BASES {
             return Err(RasterError::BadDegree { degree, bases });
         }
         let n = coefficients.len() / (3 * bases);

@@ -10,6 +10,7 @@ const MAX_PIXELS: usize = 1 << 28;
 
 /// How a camera maps a point (X, Y, Z) of its own frame to the image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum CameraModel {
     /// x = fx X / Z + cx: distant things are small.
     #[default]
@@ -100,12 +101,7 @@ impl<T: Real> Camera<T> {
         if !(k.fx > T::ZERO && k.fy > T::ZERO) {
             return bad("expected positive focal lengths");
         }
-        if width == 0 || height == 0 {
-            return bad("expected an image of at least one pixel");
-        }
-        if width > MAX_SIDE || height > MAX_SIDE || width * height > MAX_PIXELS {
-            return bad("expected an image of at most 65536 pixels a side and 2^28 in all");
-        }
+        check_size(width, height)?;
         Ok(Self {
             rotation,
             translation: [viewmat[0][3], viewmat[1][3], viewmat[2][3]],
@@ -131,4 +127,16 @@ impl<T: Real> Camera<T> {
     pub fn height(&self) -> usize {
         self.height
     }
+}
+
+/// Whether an image may have these sides.
+pub(crate) fn check_size(width: usize, height: usize) -> Result<(), RasterError> {
+    let bad = |reason| Err(RasterError::BadCamera { reason });
+    if width == 0 || height == 0 {
+        return bad("expected an image of at least one pixel");
+    }
+    if width > MAX_SIDE || height > MAX_SIDE || width * height > MAX_PIXELS {
+        return bad("expected an image of at most 65536 pixels a side and 2^28 in all");
+    }
+    Ok(())
 }

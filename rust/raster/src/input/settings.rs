@@ -21,7 +21,9 @@ pub struct RasterSettings {
     pub alpha_threshold: f64,
     /// Alpha is limited to this, so that transmittance never reaches 0 and gradients stay finite.
     pub max_alpha: f64,
-    /// A pixel stops before the Gaussian that would bring its transmittance to this or less. 0 never stops.
+    /// A pixel stops before the Gaussian that would bring its transmittance to this or less. Numbers below the floor of the
+    /// scalar, 1e-30 for `f32` and 1e-290 for `f64`, stand for that floor, 0 too: nothing behind it can be seen, and the
+    /// backward pass could not divide by what is left.
     pub min_transmittance: f64,
     /// Degree of the polynomial that stands for powers of two in `f32`: 3, 4 or 5, with relative errors of alpha of
     /// 1e-4, 3e-6 and 1e-7, the last being those of the type. `f64` has one of degree 12, and only takes 5 here.
@@ -97,6 +99,7 @@ impl RasterSettings {
 
 /// What an image holds, named as in gsplat.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum RenderMode {
     /// The colours.
     Rgb,
@@ -126,6 +129,12 @@ impl RenderMode {
     /// Whether the image holds the colours.
     pub fn has_colors(self) -> bool {
         matches!(self, Self::Rgb | Self::RgbDepth | Self::RgbExpectedDepth)
+    }
+
+    /// Channels of an image of Gaussians with so many.
+    pub(crate) fn channels(self, of_gaussians: usize) -> usize {
+        let colors = if self.has_colors() { of_gaussians } else { 0 };
+        colors.saturating_add(usize::from(self.has_depth()))
     }
 
     /// Whether its last channel is depth.
@@ -163,6 +172,13 @@ impl<T: Real> Limits<T> {
             return Err(RasterError::BadSetting {
                 name: "exp_degree",
                 expected: "5 with 64-bit floats, which have one degree only",
+            });
+        }
+        // In `f32` numbers close enough to 1 are 1, and the transmittance behind an alpha of 1 cannot be divided by.
+        if !(T::of(settings.max_alpha) < T::ONE) {
+            return Err(RasterError::BadSetting {
+                name: "max_alpha",
+                expected: "a number in (0, 1) that the scalar can tell from 1",
             });
         }
         Ok(Self {

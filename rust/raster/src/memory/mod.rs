@@ -1,4 +1,5 @@
-//! Buffers that are used again, and slices that threads share.
+//! Buffers that are used again, arrays that callers get, and slices that threads share.
 
 pub(crate) mod pool;
+pub(crate) mod results;
 pub(crate) mod shared_slice;

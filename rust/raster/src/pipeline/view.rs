@@ -7,7 +7,7 @@ use crate::composite::kernel::Channels;
 use crate::composite::scene::Scene;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
-use crate::input::gaussians::Gaussians;
+use crate::input::gaussians::{Gaussians, check_length};
 use crate::input::settings::{Limits, RenderMode};
 use crate::lists::tile_lists::TileLists;
 use crate::memory::pool::Pooled;
@@ -35,8 +35,13 @@ pub(crate) struct Image<'a, T> {
 /// What the forward pass of a view keeps for the backward pass.
 #[derive(Debug)]
 pub(crate) struct ViewState<T: Scalar> {
-    grid: TileGrid,
+    camera: Camera<T>,
+    mode: RenderMode,
     limits: Limits<T>,
+    grid: TileGrid,
+    channels: usize,
+    background: Option<Vec<T>>,
+    pixel_mask: Option<Vec<bool>>,
     projected: Pooled<Projected<T>>,
     lists: Pooled<TileLists>,
     canvas: Pooled<Canvas<T>>,
@@ -89,7 +94,8 @@ impl<T: Scalar> ViewState<T> {
     }
 }
 
-pub(crate) fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
+/// Where the channels of an image come from.
+fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
     let colored = if mode.has_colors() { gaussians.channels } else { 0 };
     Channels {
         colors: gaussians.colors,
@@ -99,6 +105,7 @@ pub(crate) fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode)
     }
 }
 
+/// What all tiles share of a view whose splats are projected and listed.
 pub(crate) fn scene<'a, T: Scalar>(
     view: &View<'a, T>,
     mode: RenderMode,
@@ -153,37 +160,63 @@ pub(crate) fn render_view<T: Scalar>(
     let scene = scene(view, mode, limits, &projected, &lists);
     let canvas = T::composite(&scene, image.colors, image.alphas);
     Ok(ViewState {
-        grid,
+        camera: view.camera,
+        mode,
         limits: *limits,
+        grid,
+        channels: view.gaussians.channels,
+        background: view.background.map(<[T]>::to_vec),
+        pixel_mask: view.pixel_mask.map(<[bool]>::to_vec),
         projected,
         lists,
         canvas,
     })
 }
 
-/// The vjp of [`render_view`]; returns how many tiles had no incoming gradient. Gradients are added.
-pub(crate) fn render_view_vjp<T: Scalar>(
-    view: &View<'_, T>,
-    mode: RenderMode,
-    limits: &Limits<T>,
-    state: &ViewState<T>,
-    v: Cotangents<'_, T>,
-    out: ViewGradients<'_, T>,
-) -> usize {
-    let scene = scene(view, mode, limits, &state.projected, &state.lists);
-    let gradients = T::composite_vjp(&scene, &state.canvas, v, !out.absgrad.is_empty());
-    for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
-        *sum += v;
+impl<T: Scalar> ViewState<T> {
+    /// The vjp of [`render_view`], given the Gaussians that it rendered; returns how many tiles had no incoming gradient.
+    /// Gradients are added.
+    ///
+    /// # Errors
+    /// Another number of Gaussians or channels, or gradients of another length than the image.
+    pub(crate) fn vjp(
+        &self,
+        gaussians: &Gaussians<'_, T>,
+        v: Cotangents<'_, T>,
+        out: ViewGradients<'_, T>,
+    ) -> Result<usize, RasterError> {
+        check_length("means", self.projected.splats.len(), gaussians.len())?;
+        if gaussians.channels != self.channels {
+            return Err(RasterError::BadSize {
+                name: "colors",
+                expected: "as many channels as were rendered",
+                got: gaussians.channels,
+            });
+        }
+        let view = View {
+            gaussians: *gaussians,
+            camera: self.camera,
+            background: self.background.as_deref(),
+            pixel_mask: self.pixel_mask.as_deref(),
+        };
+        let scene = scene(&view, self.mode, &self.limits, &self.projected, &self.lists);
+        let pixels = self.grid.width * self.grid.height;
+        check_length("v_colors", pixels * scene.channels.total, v.colors.len())?;
+        check_length("v_alphas", pixels, v.alphas.len())?;
+        let gradients = T::composite_vjp(&scene, &self.canvas, v, !out.absgrad.is_empty());
+        for (sum, &v) in out.background.iter_mut().zip(&gradients.background) {
+            *sum += v;
+        }
+        T::project_vjp(
+            gaussians,
+            &self.camera,
+            &self.limits,
+            &self.projected,
+            &self.lists,
+            scene.channels,
+            gradients.intersections.written(),
+            out,
+        );
+        Ok(gradients.tiles_skipped)
     }
-    T::project_vjp(
-        &view.gaussians,
-        &view.camera,
-        limits,
-        &state.projected,
-        &state.lists,
-        scene.channels,
-        gradients.intersections.written(),
-        out,
-    );
-    gradients.tiles_skipped
 }

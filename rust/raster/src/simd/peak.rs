@@ -23,6 +23,11 @@ pub fn simd_level() -> Result<&'static str, RasterError> {
     SimdLevel::chosen().map(SimdLevel::name)
 }
 
+/// The levels of this machine, the best first: what `BIGS_RASTER_SIMD` may name.
+pub fn simd_levels() -> Vec<&'static str> {
+    SimdLevel::available().into_iter().map(SimdLevel::name).collect()
+}
+
 /// Measured peak of one thread in 10⁹ operations per second, `f32`, at [`simd_level`]; a multiply-add is two.
 ///
 /// The baseline of x86-64 has no fused instruction and does a multiplication and an addition instead. Takes about 20 ms.

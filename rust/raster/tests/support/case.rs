@@ -1,8 +1,8 @@
 //! One call of the public API with arbitrary and adversarial inputs.
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, Camera, CameraModel, Gaussians, Intrinsics, RasterError, RasterSettings,
-    RenderMode, Renderer, Scalar, Slabs, Wanted,
+    Batch, BatchInputs, BatchShape, Camera, CameraModel, GaussianSlabs, Gaussians, Intrinsics, RasterError,
+    RasterSettings, RenderMode, Renderer, Scalar, Slabs, Wanted,
 };
 
 use super::dice::{Dice, Wildness, number, scalar};
@@ -243,11 +243,13 @@ impl<T: Scalar> Case<T> {
     fn inputs(&self) -> BatchInputs<'_, T> {
         let of_gaussians = |data, own| self.slabs(data, own, false);
         BatchInputs {
-            means: of_gaussians(&self.means, self.per_entry[0]),
-            quats: of_gaussians(&self.quats, self.per_entry[1]),
-            scales: of_gaussians(&self.scales, self.per_entry[2]),
-            opacities: of_gaussians(&self.opacities, self.per_entry[3]),
-            colors: of_gaussians(&self.colors, self.per_entry[4]),
+            gaussians: GaussianSlabs {
+                means: of_gaussians(&self.means, self.per_entry[0]),
+                quats: of_gaussians(&self.quats, self.per_entry[1]),
+                scales: of_gaussians(&self.scales, self.per_entry[2]),
+                opacities: of_gaussians(&self.opacities, self.per_entry[3]),
+                colors: of_gaussians(&self.colors, self.per_entry[4]),
+            },
             viewmats: self.slabs(&self.viewmats, true, true),
             ks: self.slabs(&self.ks, true, true),
             backgrounds: self.backgrounds.as_deref().map(|b| self.slabs(b, true, true)),
@@ -260,7 +262,12 @@ impl<T: Scalar> Case<T> {
     pub fn render(&self) -> Result<Vec<(&'static str, Vec<T>)>, RasterError> {
         let batch = Batch::new(self.shape, self.inputs(), &self.settings, self.mode)?;
         let (images, state) = batch.render()?;
-        let v = batch.render_vjp(&state, Some(&self.v_colors), Some(&self.v_alphas), self.wanted)?;
+        let v = state.vjp(
+            &self.inputs().gaussians,
+            Some(&self.v_colors),
+            Some(&self.v_alphas),
+            self.wanted,
+        )?;
         Ok(vec![
             ("colors", images.colors),
             ("alphas", images.alphas),
@@ -303,7 +310,7 @@ impl<T: Scalar> Case<T> {
         let frame = renderer.render(&gaussians, &camera, background)?;
         let v_colors = &self.v_colors[..frame.colors.len()];
         let v_alphas = &self.v_alphas[..frame.alphas.len()];
-        let grads = renderer.render_vjp(&gaussians, &camera, background, &frame, v_colors, v_alphas)?;
+        let grads = frame.vjp(&gaussians, v_colors, v_alphas)?;
         Ok((frame.colors, grads.opacities))
     }
 }

@@ -152,6 +152,7 @@ pub fn naive_with(
                 CameraModel::Orthographic => {
                     ([fx * p[0] + cx, fy * p[1] + cy], [[fx, 0.0, 0.0], [0.0, fy, 0.0]])
                 }
+                _ => panic!("{model:?} has no reference"),
             };
             let a: [[f64; 3]; 2] = std::array::from_fn(|row| {
                 std::array::from_fn(|k| {

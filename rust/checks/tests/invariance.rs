@@ -1,5 +1,6 @@
 //! The same bits for any number of threads; a sort that sorts; inputs that are refused.
 
+#[path = "../../raster/tests/support/mod.rs"]
 mod support;
 
 use bigs_raster::{
@@ -25,9 +26,7 @@ fn render_with(threads: usize) -> (Vec<u32>, GaussianGrads<f32>) {
         let frame = renderer.render(&scene.view(), &camera, None).unwrap();
         let v_colors: Vec<f32> = (0..frame.colors.len()).map(|i| (i % 7) as f32 - 3.0).collect();
         let v_alphas: Vec<f32> = (0..frame.alphas.len()).map(|i| (i % 5) as f32 - 2.0).collect();
-        let grads = renderer
-            .render_vjp(&scene.view(), &camera, None, &frame, &v_colors, &v_alphas)
-            .unwrap();
+        let grads = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
         (bits(&frame.colors), grads)
     })
 }

@@ -1,12 +1,13 @@
 //! What holds for every scene, and the same bits for any number of threads.
 
-#[path = "support/fuzz.rs"]
+#[path = "../../raster/tests/support/fuzz.rs"]
 mod fuzz;
+#[path = "../../raster/tests/support/mod.rs"]
 mod support;
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, CameraModel, GaussianGrads, RasterSettings, RenderMode, Renderer, Scalar,
-    Slabs, Wanted,
+    Batch, BatchInputs, BatchShape, CameraModel, GaussianGrads, GaussianSlabs, RasterSettings, RenderMode,
+    Renderer, Scalar, Slabs, Wanted,
 };
 use proptest::prelude::*;
 use support::{Random, Scene, VIEWMAT, camera, intrinsics, naive, relative};
@@ -26,9 +27,7 @@ fn render<T: Scalar>(
     let mut r = Random::new(5);
     let mut noise = |count: usize| -> Vec<T> { (0..count).map(|_| T::of(r.uniform(-1.0, 1.0))).collect() };
     let (v_colors, v_alphas) = (noise(frame.colors.len()), noise(frame.alphas.len()));
-    let grads = renderer
-        .render_vjp(&scene.view(), &camera, background, &frame, &v_colors, &v_alphas)
-        .unwrap();
+    let grads = frame.vjp(&scene.view(), &v_colors, &v_alphas).unwrap();
     (frame.colors, frame.alphas, grads)
 }
 
@@ -193,11 +192,13 @@ fn batch_bits<T: Scalar>(threads: usize, mode: RenderMode, channels: usize, mask
         cameras: 2,
     };
     let inputs = BatchInputs {
-        means: own(&means),
-        quats: own(&quats),
-        scales: shared(scenes[0].scales.as_flattened()),
-        opacities: shared(&scenes[0].opacities),
-        colors: own(&colors),
+        gaussians: GaussianSlabs {
+            means: own(&means),
+            quats: own(&quats),
+            scales: shared(scenes[0].scales.as_flattened()),
+            opacities: shared(&scenes[0].opacities),
+            colors: own(&colors),
+        },
         viewmats: views(&viewmats),
         ks: shared(&ks),
         backgrounds: Some(views(&backgrounds)),
@@ -227,8 +228,8 @@ fn batch_bits<T: Scalar>(threads: usize, mode: RenderMode, channels: usize, mask
     pool.install(|| {
         let batch = Batch::new(shape, inputs, &RasterSettings::default(), mode).unwrap();
         let (images, state) = batch.render().unwrap();
-        let v = batch
-            .render_vjp(&state, Some(&v_colors), Some(&v_alphas), all)
+        let v = state
+            .vjp(&inputs.gaussians, Some(&v_colors), Some(&v_alphas), all)
             .unwrap();
         let parts = [
             images.colors,

@@ -53,7 +53,7 @@ fn benchmark(workload: &Workload, group: &mut BenchmarkGroup<'_, WallTime>) {
         renderer.render(&gaussians, &camera, None)
     });
     time(group, "backward", pairs, || {
-        renderer.render_vjp(&gaussians, &camera, None, &frame, &v_colors, &v_alphas)
+        frame.vjp(&gaussians, &v_colors, &v_alphas)
     });
 }
 

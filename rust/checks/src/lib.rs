@@ -1,0 +1,1 @@
+//! Nothing: what this package holds are the property tests in `tests` and the benchmarks in `benches`.

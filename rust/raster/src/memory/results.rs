@@ -1,0 +1,47 @@
+//! Arrays that a caller gets.
+
+use crate::error::RasterError;
+
+/// Bytes from which memory is asked for before it is used: less is taken for granted.
+const LARGE: usize = 1 << 24;
+
+/// The product of sizes, or the largest number there is.
+pub(crate) fn product(sizes: &[usize]) -> usize {
+    sizes
+        .iter()
+        .fold(1, |product, &size| product.saturating_mul(size))
+}
+
+/// An array of as many values as the product of `sizes`.
+///
+/// # Errors
+/// [`RasterError::OutOfMemory`].
+pub(crate) fn filled_with<U: Clone>(
+    name: &'static str,
+    value: U,
+    sizes: &[usize],
+) -> Result<Vec<U>, RasterError> {
+    let elements = product(sizes);
+    let bytes = elements.saturating_mul(size_of::<U>());
+    // Asked for and given back at once: `vec!` gets zeros from the system for nothing, but ends the process where there
+    // are none.
+    if bytes >= LARGE && Vec::<U>::new().try_reserve_exact(elements).is_err() {
+        return Err(RasterError::OutOfMemory { name, elements });
+    }
+    Ok(vec![value; elements])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_beyond_numbers_and_memory_are_errors() {
+        assert_eq!(filled_with("a", 0u8, &[3, 5]).map(|a| a.len()), Ok(15));
+        assert_eq!(filled_with("a", 0u8, &[0, usize::MAX, 2]).map(|a| a.len()), Ok(0));
+        for sizes in [[usize::MAX, 2], [1 << 62, 1]] {
+            let refused = filled_with("a", 0.0f64, &sizes);
+            assert!(matches!(refused, Err(RasterError::OutOfMemory { name: "a", .. })));
+        }
+    }
+}
