@@ -25,6 +25,13 @@ pub(crate) fn slice<'py, T: Element>(
     Ok(array.readonly())
 }
 
+/// Whether the first of some arrays, whose dtype all must have, is float32.
+pub(crate) fn is_single(arrays: &Bound<'_, PyTuple>) -> bool {
+    arrays
+        .get_item(0)
+        .is_ok_and(|array| array.cast::<PyArrayDyn<f32>>().is_ok())
+}
+
 /// How many slabs an array holds: entries, cameras.
 pub(crate) type Count = (usize, usize);
 

@@ -11,7 +11,7 @@ use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
-use crate::convert::{Arrays, Count, Gaussians, array, contiguous, gradient, slice};
+use crate::convert::{Arrays, Count, Gaussians, array, contiguous, gradient, is_single, slice};
 
 /// What the forward pass keeps for the backward pass. Opaque; usable any number of times.
 #[pyclass(frozen, module = "bigs._raster")]
@@ -164,16 +164,12 @@ fn rasterize_forward<'py>(
 ) -> PyResult<Bound<'py, PyTuple>> {
     let (settings, size) = (settings.into(), (width, height));
     let mode = (mode_named(render_mode)?, camera_model_named(camera_model)?);
-    match Arrays::<f32>::extract(arrays, counts) {
-        Ok(single) => forward(py, &single, &lead, size, &settings, mode),
-        Err(_) => forward(
-            py,
-            &Arrays::<f64>::extract(arrays, counts)?,
-            &lead,
-            size,
-            &settings,
-            mode,
-        ),
+    if is_single(arrays) {
+        let arrays = Arrays::<f32>::extract(arrays, counts)?;
+        forward(py, &arrays, &lead, size, &settings, mode)
+    } else {
+        let arrays = Arrays::<f64>::extract(arrays, counts)?;
+        forward(py, &arrays, &lead, size, &settings, mode)
     }
 }
 

@@ -6,7 +6,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-use crate::convert::{contiguous, gradient, rows, slice};
+use crate::convert::{contiguous, gradient, is_single, rows, slice};
 use crate::run;
 
 /// The arrays of a call, borrowed for as long as this lives.
@@ -72,9 +72,10 @@ pub(crate) fn harmonics_forward<'py>(
     degree: usize,
     arrays: &Bound<'py, PyTuple>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    match Arrays::<f32>::extract(arrays) {
-        Ok(single) => forward(py, degree, &single),
-        Err(_) => forward(py, degree, &Arrays::<f64>::extract(arrays)?),
+    if is_single(arrays) {
+        forward(py, degree, &Arrays::<f32>::extract(arrays)?)
+    } else {
+        forward(py, degree, &Arrays::<f64>::extract(arrays)?)
     }
 }
 
@@ -105,8 +106,9 @@ pub(crate) fn harmonics_backward<'py>(
     v_colors: &Bound<'py, PyAny>,
     wanted: [bool; 2],
 ) -> PyResult<Bound<'py, PyTuple>> {
-    match Arrays::<f32>::extract(arrays) {
-        Ok(single) => backward(py, degree, &single, v_colors, wanted),
-        Err(_) => backward(py, degree, &Arrays::<f64>::extract(arrays)?, v_colors, wanted),
+    if is_single(arrays) {
+        backward(py, degree, &Arrays::<f32>::extract(arrays)?, v_colors, wanted)
+    } else {
+        backward(py, degree, &Arrays::<f64>::extract(arrays)?, v_colors, wanted)
     }
 }
