@@ -8,7 +8,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-/// A borrowed array of this scalar, in C's order; `TypeError` for another dtype, `ValueError` for another order.
+/// A borrowed array of this scalar; `TypeError` for another dtype.
 pub(crate) fn slice<'py, T: Element>(
     name: &str,
     array: &Bound<'py, PyAny>,
@@ -16,12 +16,6 @@ pub(crate) fn slice<'py, T: Element>(
     let array = array
         .cast::<PyArrayDyn<T>>()
         .map_err(|_| PyTypeError::new_err(format!("{name}: expected one floating dtype for all arrays")))?;
-    // A slice can be had of Fortran's order, too: the same values at other places.
-    if !array.is_c_contiguous() {
-        return Err(PyValueError::new_err(format!(
-            "{name}: expected a C-contiguous array"
-        )));
-    }
     Ok(array.readonly())
 }
 
@@ -40,7 +34,7 @@ pub(crate) fn contiguous<'a, U: Element>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, U>,
 ) -> PyResult<&'a [U]> {
-    // `as_slice` alone takes Fortran order, too.
+    // `as_slice` alone takes Fortran's order, too: the same values at other places.
     match array.as_slice() {
         Ok(values) if array.is_c_contiguous() => Ok(values),
         _ => Err(PyValueError::new_err(format!(
