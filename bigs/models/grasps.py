@@ -27,6 +27,8 @@ class Grasps(nn.Module):
         super().__init__()
         self.mirrored = mirrored
         self.register_buffer("of_frame", torch.full((n_frames,), -1))
+        # How sure it is that a frame belongs to its grasp; 0 where there is none.
+        self.register_buffer("certainty", torch.zeros(n_frames))
         # What a frame of a grasp may add of its own: the factor on its residuals.
         self.register_buffer("slack", torch.zeros(()))
         self.register_buffer("base_orient", torch.eye(3).repeat(n_frames, 1, 1))
@@ -62,7 +64,14 @@ class Grasps(nn.Module):
         )
 
     @torch.no_grad()
-    def set(self, of_frame: Tensor, slack: float, hand: HandFrames, object_frames: ObjectFrames) -> None:
+    def set(
+        self,
+        of_frame: Tensor,
+        slack: float,
+        hand: HandFrames,
+        object_frames: ObjectFrames,
+        certainty: Tensor | None = None,
+    ) -> None:
         """Start grasps from all frames' poses of hand and object: a grasp takes the mean of its frames.
 
         Args:
@@ -70,11 +79,13 @@ class Grasps(nn.Module):
             slack: factor on the residuals of frames in a grasp; 0 makes it rigid.
             hand: poses of the canonical hand in all T frames, the wrist in true camera space.
             object_frames: the object's poses in all T frames.
+            certainty: [T] in [0, 1], how sure each frame's grasp is; 1 in all grasps if not given.
         """
         for parameter in self.parameters():
             parameter.zero_()
         self.of_frame.copy_(of_frame)
         self.slack.fill_(slack)
+        self.certainty.copy_((of_frame >= 0).to(self.certainty) if certainty is None else certainty)
         orient = self._seen(object_frames.rotations).transpose(-1, -2) @ hand.global_orient
         away = (hand.wrist - object_frames.centers)[..., None]
         position = (object_frames.rotations.transpose(-1, -2) @ away)[..., 0] / object_frames.scale

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from bigs.geometry.distance import DistanceField
-from bigs.hand import HandModel
+from bigs.hand import HandModel, mirror_points
 from bigs.models.grasps import Grasps
-from bigs.models.hand_splats import CanonicalHand, HandSplats
+from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_splats
 from bigs.models.lighting import Lighting
 from bigs.models.moments import Moments
 from bigs.models.object_splats import CanonicalObject, ObjectSplats
-from bigs.models.poses import HandPoses, ObjectPoses
+from bigs.models.poses import HandFrames, HandPoses, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
 
 
@@ -129,6 +129,13 @@ class Scene(nn.Module):
     def at(self, frames: Tensor) -> Moments:
         """Hands and object at `frames` [B]."""
         return Moments(self, frames)
+
+    def posed_hand(self, side: Side, poses: HandFrames, hand: CanonicalHand) -> Gaussians:
+        """Any Gaussians of the canonical hand in any poses of a side [B], unlit, in camera space."""
+        model, betas = self.hand_model(side), self.hand_betas(side)
+        wrist = mirror_points(poses.wrist) if side == "left" else poses.wrist
+        skeleton = model.skeleton(betas, poses.hand_pose, poses.global_orient, wrist)
+        return pose_splats(hand, betas, poses.hand_pose, skeleton.bone_transforms, side)
 
     def free_frames(self, side: Side) -> Tensor:
         """The frames in which a hand belongs to no grasp, rising."""

@@ -62,20 +62,32 @@ class ScaleSearchStage:
 
 @dataclass(frozen=True)
 class GraspStage:
-    """Grasps: from here on the object carries a hand while it holds on (see `models.grasps`)."""
+    """Grasps: from here on the object carries a hand while it holds on (see `train.grasps`)."""
 
     name: str = "grasps"
     step: Step = "interacting-subjects"
-    # A hand that moves less than this against the object between two frames holds it, metres.
-    speed: float = 0.005
+    # A frame outside grasps costs as much as one in a grasp whose squared error is this, in standard
+    # deviations; a grasp costs as much as a few frames outside, so that five frames can be one.
+    free: float = 3.0
+    grasp: float = 8.0
     # Fewer frames than this are no grasp.
     least: int = 4
+    # Nobody lets go and takes hold elsewhere in fewer frames than this: a sixth of a second.
+    gap: int = 5
+    # Where estimates have a hand, across the view and along it, as standard deviations per metre of distance:
+    # an outline tells the place to a few millimetres, and its size tells the distance to a few per cent.
+    error_aside: float = 0.007
+    error_along: float = 0.03
+    # Disagreement with the masks, in squared error per pixel of the hand beyond that of the frame's own
+    # estimate, that costs as much as a frame outside: about a third of the hand beside its mask.
+    excess: float = 0.4
+    # Long side in pixels at which masks are compared, and how often grasps are carried and cut anew.
+    image_size: int = 160
+    rounds: int = 2
     # A hand that changes its grasp within so many frames turns evenly from one to the next.
     longest_move: int = 16
     # What a frame of a grasp may add of its own, as a factor on its residuals; 0 makes grasps rigid.
     slack: float = 0.1
-    # Up to so many frames of a faulty estimate do not end a grasp.
-    bridge: int = 3
 
 
 @dataclass(frozen=True)

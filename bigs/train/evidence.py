@@ -11,8 +11,10 @@ from torch import Tensor
 from bigs.data.base import Clip
 from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_splats import CanonicalHand, silhouette_hand
+from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
-from bigs.train.config import RunConfig, ScaleSearchStage, Stage
+from bigs.train.config import GraspStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.grasps import Mismatch
 from bigs.train.initial import touching_frames
 from bigs.train.step import Evidence, Step
 from bigs.train.targets import Targets, crop_box, load_targets
@@ -78,6 +80,25 @@ class EvidenceSource:
         with torch.no_grad():
             canonical = self.scene.canonical(entities)
         return lambda: float(labels(Step(self.scene, evidence, entities, canonical, frames)))
+
+    def mismatch(self, stage: GraspStage) -> Mismatch:
+        """How badly a hand's outline, in any poses of all frames, disagrees with its masks."""
+        evidence = self.evidence(stage)
+        frames = torch.arange(len(self.clip))
+        step = Step(self.scene, evidence, (), {}, frames)
+
+        @torch.no_grad()
+        def ask(side: Side, poses: HandFrames) -> Tensor:
+            posed = self.scene.posed_hand(side, poses, evidence.silhouettes[side])
+            alphas = step.render(posed).alphas.squeeze(-1)
+            own, hidden = evidence.targets.shares[side], evidence.targets.hidden[side]
+            squares = (alphas - alphas.clamp(own, own + hidden)).square().sum((1, 2))
+            # A hand that hardly shows is no measure of what is wrong with it.
+            area = own.sum((1, 2))
+            shown = evidence.targets.foreground.sum((1, 2)) > 0
+            return torch.where(shown, squares / area.clamp_min(0.25 * area.median()), torch.nan)
+
+        return ask
 
     def targets(self, size: int) -> Targets:
         if size not in self._targets:

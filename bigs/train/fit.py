@@ -138,9 +138,9 @@ def fit(
             factor, _, _ = search_object_scale(scene, stage, sources.touching(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
         elif isinstance(stage, GraspStage):
-            for side, stretches in find_grasps(scene, stage, sources.meeting).items():
-                spans = ", ".join(f"{stretch.start}-{stretch.stop - 1}" for stretch in stretches)
-                text = f"{side} hand holds the object in frames {spans or '(none)'}"
+            grasps = find_grasps(scene, stage, sources.meeting, sources.mismatch(stage))
+            for side, found in grasps.items():
+                text = f"{side} hand holds the object in frames {found.text()}"
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, SplitStage):
             for text in _split(scene, stage):

@@ -1,8 +1,10 @@
-"""Finding grasps: over which frames does a hand stand still in the object's frame?"""
+"""Grasps of a scene: where they are, by estimates and pictures, and what frames between them start from."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,66 +12,74 @@ from torch import Tensor
 
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand import mirror_rotation
+from bigs.models.grasps import Grasps
+from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.models.scene import Scene
 from bigs.train.config import GraspStage
+from bigs.train.grasp_search import (
+    Prices,
+    Stretch,
+    certainties,
+    frame_errors,
+    grasps_by_estimates,
+    grasps_by_frames,
+)
 from bigs.types import Side
 
+# The joints that tell where a hand is: the wrist, the knuckles and the fingers' ends.
+_JOINTS = (0, 1, 4, 7, 10, 13, 16, 17, 18, 19, 20)
+# A picture says more than an estimate: in the second cut a frame pays by both, half for the estimate.
+_ESTIMATE_SHARE = 0.5
 
-def still_frames(joints: Tensor, touching: Tensor, stage: GraspStage) -> list[range]:
-    """The stretches over which a touching hand keeps its place.
+# How badly a hand's outline in poses of all T frames disagrees with its masks: [T] squared error per pixel of
+# the hand, NaN in frames whose masks say nothing.
+Mismatch = Callable[[Side, HandFrames], Tensor]
 
-    A hand that lets go and grasps again moves centimetres a frame; an estimate of a still one wavers by
-    millimetres. A step or two between two stretches is bridged if the hand is where it was.
 
-    Args:
-        joints: [T, 21, 3] in the object's frame, metres.
-        touching: [T] 1 where hand and object touch in the image.
-        stage: the thresholds.
+class FoundGrasps(NamedTuple):
+    """The grasps of one hand."""
 
-    Returns:
-        Stretches of at least `stage.least` frames, in order, disjoint.
-    """
-    speed = (joints[1:] - joints[:-1]).norm(dim=-1).mean(-1)
-    together = (touching[1:] > 0) & (touching[:-1] > 0)
-    still = (speed < stage.speed) & together
-    stretches = []
-    start = None
-    for t in range(len(joints)):
-        goes_on = t < len(still) and bool(still[t])
-        if start is None and goes_on:
-            start = t
-        elif start is not None and not goes_on:
-            stretches.append(range(start, t + 1))
-            start = None
-    bridged: list[range] = []
-    for stretch in stretches:
-        if bridged and stretch.start - bridged[-1].stop < stage.bridge:
-            before, after = joints[bridged[-1]][-3:].mean(0), joints[stretch][:3].mean(0)
-            if (after - before).norm(dim=-1).mean() < 3.0 * stage.speed:
-                bridged[-1] = range(bridged[-1].start, stretch.stop)
-                continue
-        bridged.append(stretch)
-    return [stretch for stretch in bridged if len(stretch) >= stage.least]
+    stretches: list[range]  # in order, disjoint
+    certainty: Tensor  # [T] in [0, 1]; 0 outside grasps
+
+    def text(self) -> str:
+        """In words, with the mean certainty of each."""
+        parts = [
+            f"{s.start}-{s.stop - 1} ({float(self.certainty[s.start : s.stop].mean()):.0%})"
+            for s in self.stretches
+        ]
+        return ", ".join(parts) or "(none)"
 
 
 @torch.no_grad()
-def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -> dict[Side, list[range]]:
+def find_grasps(
+    scene: Scene, stage: GraspStage, touching: dict[Side, Tensor], mismatch: Mismatch | None = None
+) -> dict[Side, FoundGrasps]:
     """Find the grasps of every hand in the scene as it is, and let the object carry the hand through them.
+
+    The estimates propose grasps. Each is then carried with the object to all frames, and what the masks say
+    there decides which frames it has: grasps grow, shrink, take the place of one another, or go.
 
     All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
     estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an
     outline tells them (see `expected_depths`).
+
+    Args:
+        scene: changed in place.
+        stage: the prices.
+        touching: for each hand [T] 1 where its mask and the object's meet.
+        mismatch: asks the pictures; without it the estimates alone decide.
     """
     frames = torch.arange(scene.n_frames)
     found = {}
     for side in scene.sides:
-        joints = scene.at(frames).in_object_frame(scene.at(frames).joints(side))
-        found[side] = still_frames(scene.object_poses.log_scale.exp() * joints, touching[side], stage)
+        at = scene.at(frames)
+        poses, carrier, own = at.hand(side), at.object, scene.hand_poses[side]
+        found[side] = _search(scene, side, stage, touching[side] > 0, mismatch)
         of_frame = torch.full((scene.n_frames,), -1)
-        for g, stretch in enumerate(found[side]):
+        for g, stretch in enumerate(found[side].stretches):
             of_frame[stretch.start : stretch.stop] = g
-        poses, own = scene.at(frames).hand(side), scene.hand_poses[side]
-        scene.grasps[side].set(of_frame, stage.slack, poses, scene.at(frames).object)
+        scene.grasps[side].set(of_frame, stage.slack, poses, carrier, found[side].certainty)
         held = scene.grasps[side].held(frames)
         own.has_expected_depth.copy_(~held & held.any())
         if held.any():
@@ -84,10 +94,107 @@ def find_grasps(scene: Scene, stage: GraspStage, touching: dict[Side, Tensor]) -
         orient = scene.at(frames).hand(side).global_orient
         seen = scene.at(frames).object.rotations
         turned = turned_between(
-            orient, mirror_rotation(seen) if side == "left" else seen, found[side], stage.longest_move
+            orient,
+            mirror_rotation(seen) if side == "left" else seen,
+            found[side].stretches,
+            stage.longest_move,
         )
         own.base_orient.copy_(turned)
     return found
+
+
+def _search(
+    scene: Scene, side: Side, stage: GraspStage, touching: Tensor, mismatch: Mismatch | None
+) -> FoundGrasps:
+    at = scene.at(torch.arange(scene.n_frames))
+    poses, carrier = at.hand(side), at.object
+    points, information = _in_object_frame(scene, side, stage)
+    touches = touching.numpy()
+    prices = Prices(stage.free, stage.grasp, stage.least, stage.gap)
+    proposed = grasps_by_estimates(points, information, touches, prices)
+    stretches = [Stretch(frames, h) for h, frames in enumerate(proposed)]
+    costs = _estimate_costs(points, information, proposed)
+    if mismatch is not None:
+        # What a hand in its own pose comes to in most frames, though not in those whose estimate is off.
+        usual = float(mismatch(side, poses).nanquantile(0.25))
+        apart = prices.free * ~touches
+        for _ in range(stage.rounds):
+            hypotheses = _hypotheses([s.frames for s in stretches], scene.n_frames, stage.least)
+            pictures = np.stack(
+                [_excess(mismatch, side, poses, carrier, h, usual) for h in hypotheses]
+                or [np.zeros((0, scene.n_frames))]
+            ).reshape(len(hypotheses), scene.n_frames)
+            by_estimate = _estimate_costs(points, information, hypotheses)
+            costs = prices.free * pictures / stage.excess + _ESTIMATE_SHARE * np.minimum(
+                by_estimate, prices.free
+            )
+            costs = np.maximum(costs, apart)
+            again = grasps_by_frames(costs, prices)
+            settled = [s.frames for s in again] == [s.frames for s in stretches]
+            stretches = again
+            if settled:
+                break
+    sure = np.zeros(scene.n_frames)
+    for frames, hypothesis in stretches:
+        sure[frames] = certainties(costs[hypothesis, frames], prices.free)
+    return FoundGrasps([s.frames for s in stretches], torch.as_tensor(sure, dtype=torch.float32))
+
+
+def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
+    """The frames that hypotheses are taken from: each grasp, two neighbours as one, and what no grasp has."""
+    found = list(stretches)
+    found += [range(a.start, b.stop) for a, b in pairwise(stretches)]
+    edges = [0, *(edge for s in stretches for edge in (s.start, s.stop)), count]
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        # Windows that overlap by half: a grasp lies in one of them for the most part.
+        step = 2 * least
+        found += [range(a, min(a + step, stop)) for a in range(start, stop - least + 1, least)]
+    return found
+
+
+def _estimate_costs(points: np.ndarray, information: np.ndarray, stretches: list[range]) -> np.ndarray:
+    """[H, T] squared errors of the estimates in every frame, for the mean hand of each stretch."""
+    rows = [frame_errors(points, information, _place(points[s], information[s])) for s in stretches]
+    return np.stack(rows) if rows else np.zeros((0, len(points)))
+
+
+def _place(points: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """The still hand [K, 3] that explains some frames best, whatever a few of them say."""
+    place = np.median(points, axis=0)
+    for _ in range(3):
+        trust = 1.0 / (1.0 + frame_errors(points, information, place))
+        weighted = trust[:, None, None] * information
+        place = np.linalg.solve(weighted.sum(0), np.einsum("tij,tkj->ik", weighted, points)).T
+    return place
+
+
+def _excess(
+    mismatch: Mismatch, side: Side, poses: HandFrames, carrier: ObjectFrames, frames: range, usual: float
+) -> np.ndarray:
+    """How much worse than `usual` a hand that the object carries through all T frames fits its masks."""
+    count = len(carrier.centers)
+    grasp = Grasps(count, mirrored=side == "left")
+    of_frame = torch.full((count,), -1)
+    of_frame[frames.start : frames.stop] = 0
+    grasp.set(of_frame, 0.0, poses, carrier)
+    grasp.of_frame.zero_()
+    carried = mismatch(side, grasp(torch.arange(count), carrier))
+    return torch.nan_to_num(carried - usual, nan=0.0).double().numpy()
+
+
+def _in_object_frame(scene: Scene, side: Side, stage: GraspStage) -> tuple[np.ndarray, np.ndarray]:
+    """Joints [T, K, 3] of a hand in the object's frame, metres, and the information [T, 3, 3] of each."""
+    at = scene.at(torch.arange(scene.n_frames))
+    joints, carrier = at.joints(side), at.object
+    points = carrier.scale * at.in_object_frame(joints)[:, list(_JOINTS)]
+    wrist = joints[:, 0].double()
+    ray = torch.nn.functional.normalize(wrist, dim=-1)
+    ray = (carrier.rotations.double().transpose(-1, -2) @ ray[..., None])[..., 0]
+    along = ray[:, :, None] * ray[:, None, :]
+    aside = torch.eye(3, dtype=torch.float64) - along
+    depth = wrist.norm(dim=-1)[:, None, None]
+    information = aside / (stage.error_aside * depth) ** 2 + along / (stage.error_along * depth) ** 2
+    return points.double().numpy(), information.numpy()
 
 
 def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest: int) -> Tensor:
@@ -100,7 +207,7 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
     Args:
         orient: [T, 3, 3] the hand's orientation.
         carrier: [T, 3, 3] the object's.
-        grasps: as `still_frames` returns them.
+        grasps: stretches of frames, in order and disjoint.
         longest: moves that take more frames than this are left as they are.
 
     Returns:

@@ -97,7 +97,11 @@ RANGES: dict[type, dict[str, Range]] = {
         "image_size": _PIXELS,
         "frames": _COUNT,
     },
-    GraspStage: {"least": Range(2, 10**9)},
+    GraspStage: {
+        "least": Range(2, 10**9),
+        **dict.fromkeys(("free", "excess", "error_aside", "error_along"), _POSITIVE),
+        "image_size": _PIXELS,
+    },
     SplitStage: {"parts": Range(1, 10), "least_opacity": _SHARE},
     GuidanceStage: {
         "views": Range(1, 1000),
