@@ -240,7 +240,12 @@ def _meshes(playback: Playback, frame: int) -> dict[str, tuple[np.ndarray, np.nd
 def _poses(playback: Playback) -> ClipPoses:
     hands = {
         side: HandPoses(
-            hand.global_orient_aa.numpy(), hand.hand_pose_aa.numpy(), hand.transl.numpy(), hand.betas.numpy()
+            hand.global_orient_aa.numpy(),
+            hand.hand_pose_aa.numpy(),
+            hand.transl.numpy(),
+            hand.betas.numpy(),
+            hand.grasp.numpy(),
+            hand.grasp_certainty.numpy(),
         )
         for side, hand in playback.hands.items()
     }

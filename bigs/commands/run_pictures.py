@@ -21,6 +21,7 @@ from bigs.train.fit import FitReport
 from bigs.viewer.coverage import coverage_map
 from bigs.viewer.preview import contact_sheet, overlay, save_picture, to_bytes, write_video
 from bigs.viewer.report import write_report
+from bigs.viewer.timeline import timeline
 
 # Degrees by which the novel view is turned about the scene.
 _NOVEL_VIEW = 40.0
@@ -69,6 +70,7 @@ def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> Non
         video=video,
         metrics=told.table,
         per_frame=_errors(told.per_frame),
+        grasps=grasp_timeline(playback),
         coverage=_coverage(clip, playback),
         log=[
             {"stage": e["stage"], "step": e["step"], "loss": e["loss"], **e["terms"]}
@@ -119,6 +121,13 @@ def _coverage(clip: Clip, playback: Playback) -> tuple[str, Image.Image] | None:
         "seen, the darker the more often, red never; dots are the camera's places around it"
     )
     return caption, found.picture
+
+
+def grasp_timeline(playback: Playback) -> str:
+    """When each hand holds the object, as an SVG element; nothing where there is no object or no hand."""
+    if playback.object is None or not playback.hands:
+        return ""
+    return timeline({side: hand.grasps() for side, hand in playback.hands.items()}, len(playback))
 
 
 def _novel_view(playback: Playback, frame: int) -> np.ndarray:

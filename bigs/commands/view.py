@@ -11,6 +11,7 @@ import torch
 
 from bigs.commands.run_clip import clip_of_run, hand_models_of_run
 from bigs.commands.run_folder import load_run
+from bigs.commands.run_pictures import grasp_timeline
 from bigs.commands.truth import load_truth
 from bigs.data.base import Clip
 from bigs.geometry.rotations import axis_angle_to_matrix, quat_to_matrix
@@ -79,6 +80,7 @@ def make_stage(playback: Playback, clip: Clip | None, truth: HandObjectTrajector
         knobs=knobs,
         image=None if clip is None else clip.image,
         truth=None if truth is None else _truth(playback, truth),
+        grasps=grasp_timeline(playback),
     )
 
 

@@ -13,7 +13,7 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_finite, check_rotations, check_shape
 from bigs.types import SIDES, Side
 
-FORMAT = "bigs-poses-1"
+FORMAT = "bigs-poses-2"
 
 
 class HandPoses(NamedTuple):
@@ -26,6 +26,8 @@ class HandPoses(NamedTuple):
     hand_pose: np.ndarray  # [T, 15, 3] axis-angle, relative to the model's hands_mean
     transl: np.ndarray  # [T, 3] metres
     betas: np.ndarray  # [10]
+    grasp: np.ndarray  # [T] number of the grasp in which the object carries the hand, -1 for none
+    grasp_certainty: np.ndarray  # [T] in [0, 1] how sure that is
 
 
 class ObjectPoses(NamedTuple):
@@ -103,7 +105,11 @@ def _check(where: str, arrays: dict[str, np.ndarray]) -> None:
         if any(key.startswith(f"{side}_") for key in arrays):
             fields = {"global_orient": (frames, 3), "hand_pose": (frames, 15, 3), "transl": (frames, 3)}
             shapes |= {f"{side}_{field}": shape for field, shape in fields.items()}
-            shapes[f"{side}_betas"] = (10,)
+            shapes |= {
+                f"{side}_betas": (10,),
+                f"{side}_grasp": (frames,),
+                f"{side}_grasp_certainty": (frames,),
+            }
     if any(key.startswith("object_") for key in arrays):
         shapes |= {"object_rotations": (frames, 3, 3), "object_transl": (frames, 3), "object_scale": ()}
     for key, shape in shapes.items():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,8 +26,17 @@ from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 _MOVING_HAND = (
     *("joints", "verts", "bones", "hand_pose", "shade"),
     *("global_orient_aa", "hand_pose_aa", "transl"),
+    *("grasp", "grasp_certainty"),
 )
 _MOVING_OBJECT = ("rotations", "centers", "shade")
+
+
+class Grasp(NamedTuple):
+    """A stretch of frames over which a hand holds the object."""
+
+    start: int  # first frame
+    stop: int  # the frame after the last
+    certainty: float  # in [0, 1], mean over its frames
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,18 @@ class HandPlayback:
     lbs_weights: Tensor  # [V, 16]
     rest_joints: Tensor  # [16, 3] in the clip's shape
     tip_vertex_ids: Tensor  # [5] thumb, index, middle, ring, pinky
+    grasp: Tensor  # [T] number of the grasp in which the object carries the hand, -1 for none
+    grasp_certainty: Tensor  # [T] in [0, 1] how sure that is; 0 where there is none
+
+    def grasps(self) -> list[Grasp]:
+        """The grasps, in order."""
+        numbers = self.grasp.tolist()
+        edges = [t for t in range(1, len(numbers)) if numbers[t] != numbers[t - 1]]
+        return [
+            Grasp(start, stop, float(self.grasp_certainty[start:stop].mean()))
+            for start, stop in pairwise([0, *edges, len(numbers)])
+            if numbers[start] >= 0
+        ]
 
 
 @dataclass(frozen=True)
@@ -202,6 +225,8 @@ def record(
             model.lbs_weights,
             model.rest_joints(betas),
             model.tip_vertex_ids,
+            scene.grasps[side].of_frame.clone(),
+            scene.grasps[side].certainty.clone(),
         )
     obj = None
     if scene.object_splats is not None:

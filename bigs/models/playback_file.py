@@ -33,7 +33,7 @@ from bigs.names import check_name
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-scene-4"
-# The same without a checksum.
+# The same without a checksum and without grasps.
 _UNSUMMED = "bigs-scene-3"
 # No camera has more pixels on a side.
 _MOST_PIXELS = 1 << 16
@@ -94,8 +94,21 @@ def load_playback(path: Path) -> Playback:
             f"{path}: expected the checksum {expected} of its content, found {shown(stored)}: the file was "
             "damaged (bigs reconstruct --resume into the same folder writes it anew)"
         )
+    if facts["format"] == _UNSUMMED:
+        tensors |= _without_grasps(tensors)
     _check(str(path), facts, tensors)
     return _assemble(facts, tensors)
+
+
+def _without_grasps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What stands for the grasps that a file of an earlier version does not tell."""
+    found: dict[str, Tensor] = {}
+    for side in SIDES:
+        joints = tensors.get(f"{side}.joints")
+        if joints is not None and joints.ndim:
+            found[f"{side}.grasp"] = torch.full((len(joints),), -1)
+            found[f"{side}.grasp_certainty"] = torch.zeros(len(joints))
+    return found
 
 
 def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -116,7 +129,7 @@ def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) 
         if name not in tensors:
             raise InputError(f"{where}: expected a tensor {name}, found none")
         check_shape(f"{where}: {name}", tensors[name], shape)
-        whole = name.endswith(("faces", "tip_vertex_ids"))
+        whole = name.endswith(("faces", "tip_vertex_ids", ".grasp"))
         if tensors[name].dtype != (torch.int64 if whole else torch.float32):
             raise InputError(
                 f"{where}: {name}: expected {'int64' if whole else 'float32'}, found {tensors[name].dtype}"
@@ -182,6 +195,8 @@ def _hand_shapes(side: Side, frames: int, tensors: Mapping[str, Tensor]) -> dict
         "lbs_weights": (n_verts, 16),
         "rest_joints": (16, 3),
         "tip_vertex_ids": (5,),
+        "grasp": (frames,),
+        "grasp_certainty": (frames,),
         "splats.points": ("N", 3),
         "splats.shapedirs": (count, 3, "any"),
         "splats.weights": (count, 16),

@@ -123,6 +123,8 @@ class Viewer:
                 self._frame = self._watched(gui.add_slider("frame", 0, stage.frames - 1, 1, 0))
                 self._playing = self._watched(gui.add_checkbox("play", False))
                 self._fps = gui.add_slider("frames a second", 1, 60, 1, round(stage.fps))
+                if stage.grasps:
+                    gui.add_html(f"<div>Hands hold the object:{stage.grasps}</div>")
         with gui.add_folder("Show"):
             self._shown = {name: self._watched(gui.add_checkbox(name, True)) for name in stage.colors}
             self._with_splats = self._watched(gui.add_checkbox("Gaussians", True))

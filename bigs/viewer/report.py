@@ -66,6 +66,7 @@ def write_report(
     video: str | Path | None = None,
     metrics: Sequence[Sequence[str]] = (),
     per_frame: Mapping[str, Sequence[float]] | None = None,
+    grasps: str = "",
     coverage: tuple[str, Image.Image] | None = None,
     log: Sequence[Mapping[str, Any]] = (),
     timings: Mapping[str, float] | None = None,
@@ -83,6 +84,7 @@ def write_report(
         metrics: a table of text, the first row its heading, as `bigs.metrics.report.comparison_table` makes
             it.
         per_frame: name -> one number a frame; those that are not finite leave a gap.
+        grasps: when hands hold the object, an SVG element as `bigs.viewer.timeline` makes it.
         coverage: what it shows -> the map of directions from which the object was seen.
         log: rows in the order they were logged: "stage" (text, optional), "step" (steps done in that stage),
             and numbers; dictionaries of numbers count as numbers of their own. Every number becomes a curve
@@ -113,6 +115,8 @@ def write_report(
     errors = [line_plot(name, range(len(y)), y) for name, y in (per_frame or {}).items()]
     if any(errors):
         parts.append(f'<h2>Errors frame by frame</h2><div class="curves">{"".join(errors)}</div>')
+    if grasps:
+        parts.append(f"<h2>When hands hold the object</h2>{grasps}")
     if coverage is not None:
         caption, picture = coverage
         parts += ["<h2>Where the object was seen from</h2>", _figure(caption, picture)]

@@ -50,4 +50,5 @@ class Stage:
     knobs: Mapping[str, Mapping[str, tuple[int, int]]] = field(default_factory=dict)  # degrees from, to
     image: Callable[[int], np.ndarray] | None = None  # frame -> [H, W, 3] uint8
     truth: Callable[[int], Mapping[str, Mesh]] | None = None  # frame -> every true subject
+    grasps: str = ""  # when hands hold the object, an SVG element
     fps: float = 30.0

@@ -16,6 +16,8 @@ def poses():
             hand_pose=rng.normal(size=(4, 15, 3)),
             transl=rng.normal(size=(4, 3)),
             betas=rng.normal(size=10),
+            grasp=np.array([0, 0, -1, 1]),
+            grasp_certainty=np.array([0.9, 0.8, 0.0, 0.7]),
         )
         for side in ("right", "left")
     }
@@ -74,7 +76,7 @@ def test_wrong_files_are_named(tmp_path, poses):
     with pytest.raises(InputError, match=r"poses\.npz: expected a poses file"):
         load_poses(path)
     np.savez(path, K=np.eye(3))
-    with pytest.raises(InputError, match="expected format bigs-poses-1, found none"):
+    with pytest.raises(InputError, match="expected format bigs-poses-2, found none"):
         load_poses(path)
     save_poses(path, poses)
     with np.load(path) as stored:
