@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.export.poses import ClipPoses, HandPoses, ObjectPoses, load_poses, save_poses
@@ -21,7 +22,7 @@ def poses():
         )
         for side in ("right", "left")
     }
-    obj = ObjectPoses(rng.normal(size=(4, 3, 3)), rng.normal(size=(4, 3)), 0.12)
+    obj = ObjectPoses(Rotation.random(4, random_state=rng).as_matrix(), rng.normal(size=(4, 3)), 0.12)
     return ClipPoses(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), np.diag([500.0, 500.0, 1.0]), hands, obj)
 
 
@@ -88,5 +89,5 @@ def test_wrong_files_are_named(tmp_path, poses):
     with pytest.raises(InputError, match="right_transl: expected numbers"):
         load_poses(path)
     np.savez(path, **arrays, right_transl=np.array([None] * 12).reshape(4, 3))
-    with pytest.raises(InputError, match=r"poses\.npz: expected an npz file"):
+    with pytest.raises(InputError, match=r"poses\.npz: .right_transl.: expected an archive of plain arrays"):
         load_poses(path)
