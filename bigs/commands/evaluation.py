@@ -129,7 +129,9 @@ def evaluate_run(
     remarks += _told_once(told)
     path = run / METRICS
     scores = read_json(path, "a run's scores") if path.exists() else {}
-    scores["result"] = scores.get("result", {}) | result
+    # An earlier score that cannot be had any more does not stand beside the reason.
+    earlier = {key: v for key, v in scores.get("result", {}).items() if key not in told}
+    scores["result"] = earlier | result
     write_json(path, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
     return Evaluation(playback.name, scores, frames, tuple(remarks), told)
