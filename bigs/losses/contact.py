@@ -26,20 +26,30 @@ def deepest_mean(distances: Tensor, count: int) -> Tensor:
     return distances.topk(min(count, distances.shape[1]), dim=1, largest=False).values.mean(1)
 
 
-def surface_contact(distances: Tensor, touching: Tensor, count: int = 30, reach: float = 0.01) -> Tensor:
-    """Draws the part of a hand that reaches furthest onto the object's surface where the image shows touch.
+def surface_gaps(distances: Tensor, count: int = 30, reach: float = 0.01) -> Tensor:
+    """How far the part of a hand that reaches furthest is from the object's surface, [B] in [0, 1).
 
     |d| / (|d| + reach) of its mean distance d: it saturates, so that a frame whose pose is wrong altogether
     does not outweigh the rest.
 
     Args:
         distances: [B, V] signed distances of the hand's vertices from the object, metres.
-        touching: [B] in [0, 1].
         count: how many vertices count as the touching part.
         reach: metres at which the pull has fallen by half.
     """
     depth = deepest_mean(distances, count).abs()
-    return (depth / (depth + reach) * touching).sum() / touching.sum().clamp_min(1.0)
+    return depth / (depth + reach)
+
+
+def surface_contact(distances: Tensor, touching: Tensor, count: int = 30) -> Tensor:
+    """Draws the part of a hand that reaches furthest onto the object's surface where the image shows touch.
+
+    Args:
+        distances: [B, V] signed distances of the hand's vertices from the object, metres.
+        touching: [B] in [0, 1].
+        count: see `surface_gaps`.
+    """
+    return (surface_gaps(distances, count) * touching).sum() / touching.sum().clamp_min(1.0)
 
 
 def penetration(distances: Tensor, tolerance: float = 0.001) -> Tensor:

@@ -65,6 +65,13 @@ class EvidenceSource:
             touching[side] = (grasps.of_frame >= 0).to(meeting) if grasps.count else meeting
         return touching
 
+    def certainty(self) -> dict[Side, Tensor]:
+        """For each hand [T] how sure it is that it touches the object: that of its grasps, once found."""
+        return {
+            side: self.scene.grasps[side].certainty if self.scene.grasps[side].count else touching
+            for side, touching in self.touching().items()
+        }
+
     def evidence(self, stage: Stage) -> Evidence:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}

@@ -135,8 +135,9 @@ def fit(
         began = time.perf_counter() - report.seconds.get(stage.name, 0.0)
         continues = position.resume if position and index == first else None
         if isinstance(stage, ScaleSearchStage):
-            factor, _, _ = search_object_scale(scene, stage, sources.touching(), sources.occlusion(stage))
-            listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
+            size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
+            listen({"event": "note", "stage": stage.name, "text": f"object size x {size.text()}"})
+            report.facts["object size"] = f"last corrected by x {size.text()}, by where hands touch it"
         elif isinstance(stage, GraspStage):
             grasps = find_grasps(scene, stage, sources.meeting, sources.mismatch(stage))
             for side, found in grasps.items():
