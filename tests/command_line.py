@@ -24,13 +24,12 @@ class Run(NamedTuple):
     answer: Answer
 
 
-def run_bigs(*arguments: str | Path, timeout: float = 600) -> Answer:
+def run_bigs(*arguments: str | Path) -> Answer:
     """The command line in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "bigs.cli", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=timeout,
         check=False,
     )
     return Answer(done.returncode, done.stdout, done.stderr)

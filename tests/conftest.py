@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from command_line import Answer, Run, run_bigs
 from fake_runs import FakeRuns
+from family import Family
 
 from bigs.cli import main
 from bigs.data.base import Clip
@@ -32,6 +34,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Why tests were skipped, a line for each reason."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in skipped)
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
 
 
 @pytest.fixture(scope="session")
@@ -67,6 +77,14 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     fake = FakeRuns()
     monkeypatch.setattr("bigs.commands.series.reconstruct", fake)
     return fake
+
+
+@pytest.fixture
+def family() -> Iterator[Family]:
+    """Starts programs and ends, with the test, what is left of them."""
+    family = Family()
+    yield family
+    family.end()
 
 
 @pytest.fixture

@@ -47,13 +47,17 @@ class Nursery:
     ) -> None:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.close()
-        self._process.wait(timeout=60)
+        self._process.wait()
         self._process.stdout.close()
 
     def start(self, *arguments: str | Path, output: Path, death: Death | None = None) -> int:
         """Start the command line, its words going to the file `output`; returns its process id."""
         order = {"arguments": list(map(str, arguments)), "output": str(output), "death": death}
         return self._ask(json.dumps(order))
+
+    def lives(self, pid: int) -> bool:
+        """Whether the process still works; one that has ended waits to be asked how."""
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
     def ended(self) -> int:
         """Wait for the end; the exit code, or minus the signal. Until then the id is nobody else's."""
@@ -108,6 +112,7 @@ def _serve() -> None:
     for line in sys.stdin:
         if not line.strip():
             print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+            pid = 0
             continue
         pid = os.fork()
         if pid == 0:
@@ -120,6 +125,10 @@ def _serve() -> None:
                 sys.stdout.flush()
                 os._exit(code)
         print(pid, flush=True)
+    # Whoever asked is gone, so nobody needs what still works.
+    if pid:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 if __name__ == "__main__":

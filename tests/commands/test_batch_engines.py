@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
-import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import fake_slurm
 import pytest
 import yaml
+from family import Family
 
-import bigs
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.types import Side
@@ -48,25 +46,34 @@ def manifest(folder: Path, clip: Path, names: list[str]) -> Path:
     return folder / "manifest.yaml"
 
 
-def start(*arguments: str | Path, said: Path) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": str(Path(bigs.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bigs.cli", "batch", *map(str, arguments)]
-    with said.open("wb") as file:
-        return subprocess.Popen(command, env=environment, stdout=file, stderr=file)
+# A process that imports this kills itself, once among all, when it has written a run's first checkpoint.
+KILLS_ITSELF = """
+import os, pathlib, signal
+rename = os.replace
+def replace(source, target, **options):
+    rename(source, target, **options)
+    path = pathlib.Path(target)
+    if path.name == "latest.safetensors":
+        try:
+            with open(os.environ["BIGS_TEST_VICTIM"], "x") as file:
+                file.write(path.parents[1].name)
+        except FileExistsError:
+            return
+        os.kill(os.getpid(), signal.SIGKILL)
+os.replace = replace
+"""
 
 
-def kill_the_first_at_work(out: Path, batch: subprocess.Popen[bytes]) -> str:
-    """Kill the worker of the first clip that has a checkpoint and is not done."""
-    end = time.monotonic() + 240
-    while time.monotonic() < end and batch.poll() is None:
-        for path in out.glob("*/status.json"):
-            status = json.loads(path.read_text())
-            begun = (path.parent / "checkpoints" / "latest.safetensors").exists()
-            if status["state"] == "running" and begun and not (path.parent / "scene.safetensors").exists():
-                os.kill(status["pid"], signal.SIGKILL)
-                return path.parent.name
-        time.sleep(0.02)
-    raise AssertionError("no clip was ever at work")
+@pytest.fixture
+def batch(family: Family, tmp_path: Path) -> Callable[..., subprocess.Popen[bytes]]:
+    """Starts `bigs batch`; its words go to tmp_path / "said"."""
+
+    def start(*arguments: str | Path, **variables: str) -> subprocess.Popen[bytes]:
+        with (tmp_path / "said").open("wb") as file:
+            env = {"OMP_NUM_THREADS": "1", **variables}
+            return family.start_bigs("batch", *arguments, env=env, stdout=file, stderr=file)
+
+    return start
 
 
 def statuses(out: Path) -> dict[str, dict]:
@@ -74,17 +81,21 @@ def statuses(out: Path) -> dict[str, dict]:
 
 
 @pytest.mark.parametrize("engine", ["ray", "processes"])
-def test_a_worker_is_killed_mid_clip(clip: Path, tmp_path: Path, engine: str) -> None:
+def test_a_worker_is_killed_mid_clip(
+    batch: Callable[..., subprocess.Popen[bytes]], clip: Path, tmp_path: Path, engine: str
+) -> None:
     if engine == "ray":
         pytest.importorskip("ray", reason="needs the extra 'ray'")
     names = ["a", "b"] if engine == "ray" else ["a"]
     out, said = tmp_path / "out", tmp_path / "said"
     options = ["--out", out, "--engine", engine, "--workers", "2", "--threads", "1"]
     path = manifest(tmp_path, clip, names)
-    batch = start(path, *options, said=said)
-    victim = kill_the_first_at_work(out, batch)
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "sitecustomize.py").write_text(KILLS_ITSELF)
+    first = {"PYTHONPATH": str(tmp_path / "first"), "BIGS_TEST_VICTIM": str(tmp_path / "victim")}
     # The clip that is not there is told by the exit code, and by its row.
-    assert batch.wait(300) == 5, said.read_text()
+    assert batch(path, *options, **first).wait() == 5, said.read_text()
+    victim = (tmp_path / "victim").read_text()
 
     found = statuses(out)
     assert {name: status["state"] for name, status in found.items()} == {
@@ -113,24 +124,39 @@ def test_a_worker_is_killed_mid_clip(clip: Path, tmp_path: Path, engine: str) ->
         return
     # Called again, nothing is done twice: only the missing clip is tried.
     before = {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names}
-    again = start(path, "--out", out, "--threads", "1", said=said)
-    assert again.wait(300) == 5
+    assert batch(path, "--out", out, "--threads", "1").wait() == 5
     assert "clips were finished before; 1 attempts" in said.read_text()
     assert {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names} == before
 
 
-def test_submitit_in_processes_of_its_own(clip: Path, tmp_path: Path) -> None:
+def test_submitit_in_processes_of_its_own(
+    batch: Callable[..., subprocess.Popen[bytes]], clip: Path, tmp_path: Path
+) -> None:
     """Without a cluster, to try it out; that the jobs do what they should is shown with Slurm's programs."""
     pytest.importorskip("submitit", reason="needs the extra 'slurm'")
     out, said = tmp_path / "out", tmp_path / "said"
-    options = ["--engine", "slurm", "--slurm-cluster", "local", "--threads", "1", "--slurm", "timeout_min=5"]
-    batch = start(manifest(tmp_path, clip, []), "--out", out, *options, said=said)
-    assert batch.wait(300) == 5, said.read_text()
+    options = [
+        "--engine",
+        "slurm",
+        "--slurm-cluster",
+        "local",
+        "--threads",
+        "1",
+        "--slurm",
+        "timeout_min=600",
+    ]
+    process = batch(manifest(tmp_path, clip, []), "--out", out, *options)
+    assert process.wait() == 5, said.read_text()
     found = statuses(out)["gone"]
-    assert found["state"] == "failed" and found["pid"] not in (0, batch.pid)
+    assert found["state"] == "failed" and found["pid"] not in (0, process.pid)
 
 
-def test_jobs_of_a_slurm_cluster(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_of_a_slurm_cluster(
+    batch: Callable[..., subprocess.Popen[bytes]],
+    clip: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As submitit speaks to Slurm; the programs that answer are stand-ins."""
     pytest.importorskip("submitit", reason="needs the extra 'slurm'")
     slurm, out, said = tmp_path / "slurm", tmp_path / "out", tmp_path / "said"
@@ -138,8 +164,7 @@ def test_jobs_of_a_slurm_cluster(clip: Path, tmp_path: Path, monkeypatch: pytest
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("PATH", f"{slurm}{os.pathsep}{os.environ['PATH']}")
     options = ["--engine", "slurm", "--threads", "1", "--slurm", "slurm_partition=cpu"]
-    batch = start(manifest(tmp_path, clip, ["a"]), "--out", out, *options, said=said)
-    assert batch.wait(300) == 5, said.read_text()
+    assert batch(manifest(tmp_path, clip, ["a"]), "--out", out, *options).wait() == 5, said.read_text()
     found = statuses(out)
     assert (found["a"]["state"], found["gone"]["state"]) == ("finished", "failed"), said.read_text()
     assert found["a"]["pid"] != found["gone"]["pid"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, get_args
 import pytest
 import torch
 from command_line import Answer, assert_refused
+from family import Family
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tiny_diffusion import as_pipeline
@@ -101,7 +101,7 @@ def test_interrupted_work_ends_in_the_same_bytes(
 
 @pytest.mark.slow
 def test_killed_work_ends_in_the_same_bytes(
-    tiny_clip: Path, tiny_model: Path, tmp_path: Path, fit: Callable[..., FittedToken]
+    family: Family, tiny_clip: Path, tiny_model: Path, tmp_path: Path, fit: Callable[..., FittedToken]
 ) -> None:
     """By a signal that nothing can catch, in a process of its own."""
     out, kept = tmp_path / "token.safetensors", tmp_path / "token.state.safetensors"
@@ -118,13 +118,8 @@ def test_killed_work_ends_in_the_same_bytes(
         "1",
     )
     command = ["prior", "fit", tiny_clip, *arguments, "--model", tiny_model, "--out", out]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "bigs.cli", *map(str, command)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 120
-    while not kept.exists() and process.poll() is None and time.monotonic() < deadline:
+    process = family.start_bigs(*command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not kept.exists() and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -26,24 +25,25 @@ def interruptible() -> Iterator[None]:
 
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_viewer_closes_when_its_drawing_has_ended() -> None:
-    drawing, ended = threading.Event(), threading.Event()
+    drawing, go_on, ended = threading.Event(), threading.Event(), threading.Event()
 
     def show(frame: int, pose: Pose) -> Mapping[str, Subject]:
         drawing.set()
-        # Longer than the interrupt and the close take.
-        time.sleep(1.0)
+        go_on.wait()
         ended.set()
         return {}
 
     stage = Stage("slow", 1, np.eye(3), 16, 16, np.array([0.0, 0.0, 0.5]), {}, show)
     with Viewer(stage, port=0) as viewer:
-        assert drawing.wait(10)
+        drawing.wait()
         main = threading.main_thread().ident
         assert main is not None
-        threading.Timer(0.2, signal.pthread_kill, (main, signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
+            threading.Timer(0.2, signal.pthread_kill, (main, signal.SIGINT)).start()
             viewer.wait()
         assert not ended.is_set()
+        # The viewer is closing by then, or will be.
+        threading.Timer(0.2, go_on.set).start()
     assert ended.is_set()
 
 
