@@ -55,11 +55,16 @@ def check_shape(name: str, array: Any, shape: Sequence[int | str | None]) -> Non
     Args:
         name: what to call the array in the message; include the file when there is one.
         array: anything with a `shape`.
-        shape: one entry per axis: an int must match, a string or None matches any length and is shown.
+        shape: one entry per axis: an int must match, a string or None matches any length and is shown. "..."
+            as the first entry stands for any number of axes.
     """
+    if not hasattr(array, "shape"):
+        raise InputError(f"{name}: expected an array, found {type(array).__name__}")
     found = tuple(array.shape)
-    matches = len(found) == len(shape) and all(
-        not isinstance(want, int) or want == have for want, have in zip(shape, found, strict=True)
+    last = tuple(shape[1:] if shape and shape[0] == "..." else shape)
+    compared = found[max(0, len(found) - len(last)) :] if len(last) < len(shape) else found
+    matches = len(compared) == len(last) and all(
+        not isinstance(want, int) or want == have for want, have in zip(last, compared, strict=True)
     )
     if not matches:
         expected = ", ".join("any" if want is None else str(want) for want in shape)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bigs.checks import check_shape
 from bigs.models.playback import Playback
 from bigs.raster import rasterization
 from bigs.types import Entity
@@ -27,7 +28,12 @@ def render_frame(
 
     `viewmat` [4, 4] leads from the clip's camera frame of that time to the rendering camera (OpenCV axes);
     `entities` are those shown, all if not given.
+
+    Raises:
+        InputError: a shape that does not fit, or a frame that the clip has not.
     """
+    check_shape("viewmat", viewmat, (4, 4))
+    check_shape("K", K, (3, 3))
     out = rasterization(*playback.gaussians([frame], entities), viewmat[None], K[None], width, height)
     return out.colors[0, 0].numpy(), out.alphas[0, 0, ..., 0].numpy()
 
@@ -38,8 +44,10 @@ def render_depth(
 ) -> np.ndarray:
     """Camera z [H, W], metres, of the Gaussian at which half of a pixel's light is gone; 0 where half passes.
 
-    The arguments are those of `render_frame`.
+    The arguments are those of `render_frame`, and so are the errors.
     """
+    check_shape("viewmat", viewmat, (4, 4))
+    check_shape("K", K, (3, 3))
     out = rasterization(
         *playback.gaussians([frame]), viewmat[None], K[None], width, height, median_depth=True
     )

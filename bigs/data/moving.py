@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bigs.checks import check_shape
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack, ObjectTrack
 from bigs.types import Side
@@ -23,7 +24,12 @@ def move_hand(track: HandTrack, new_from_old: np.ndarray, rest_wrist: np.ndarray
         track: the hand.
         new_from_old: rigid motions [T, 4, 4] with rotation A and translation b.
         rest_wrist: J0, the rest wrist joint of the track's shape, [3] metres, of that side's model.
+
+    Raises:
+        InputError: another shape.
     """
+    check_shape("new_from_old", new_from_old, (len(track.transl), 4, 4))
+    check_shape("rest_wrist", rest_wrist, (3,))
     rotation, translation = new_from_old[:, :3, :3], new_from_old[:, :3, 3]
     turned = rotation @ Rotation.from_rotvec(track.global_orient).as_matrix()
     wrists = np.einsum("tij,tj->ti", rotation, rest_wrist + track.transl) + translation
@@ -31,7 +37,12 @@ def move_hand(track: HandTrack, new_from_old: np.ndarray, rest_wrist: np.ndarray
 
 
 def move_object(track: Rigid, new_from_old: np.ndarray) -> Rigid:
-    """An object in another world, by rigid motions [T, 4, 4]."""
+    """An object in another world, by rigid motions [T, 4, 4].
+
+    Raises:
+        InputError: another shape.
+    """
+    check_shape("new_from_old", new_from_old, (len(track.transl), 4, 4))
     rotation, translation = new_from_old[:, :3, :3], new_from_old[:, :3, 3]
     return replace(
         track,
@@ -49,7 +60,12 @@ def in_world(
         annotation: what to carry over.
         new_from_old: a rigid motion [4, 4], or one for each frame [T, 4, 4].
         rest_wrists: the rest wrist joint [3] of each hand's shape, metres.
+
+    Raises:
+        InputError: another shape.
     """
+    if new_from_old.shape != (4, 4):
+        check_shape("new_from_old", new_from_old, (len(annotation), 4, 4))
     motions = np.broadcast_to(new_from_old, (len(annotation), 4, 4))
     return replace(
         annotation,

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from bigs.checks import check_shape
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand.lbs import forward_kinematics, pose_corrective, shape_vertices, skin_points
 from bigs.hand.mirror import mirror_axis_angle, mirror_points
@@ -101,6 +102,7 @@ class HandModel(nn.Module):
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Vertices [..., V, 3] of the shape `betas` [..., 10] in the rest pose, metres."""
+        check_shape("betas", betas, ("...", self.shapedirs.shape[-1]))
         return shape_vertices(self.v_template, self.shapedirs, betas)
 
     def rest_joints(self, betas: Tensor) -> Tensor:
@@ -122,7 +124,16 @@ class HandModel(nn.Module):
 
         Returns:
             Vertices, 21 joints and bone transforms in the frame of `wrist`.
+
+        Raises:
+            InputError: a shape that does not fit.
         """
+        fingers = len(self.parents) - 1
+        check_shape("hand_pose", hand_pose, ("T", fingers, 3, 3))
+        check_shape("global_orient", global_orient, (len(hand_pose), 3, 3))
+        check_shape("wrist", wrist, (len(hand_pose), 3))
+        if getattr(betas, "ndim", 1) != 1:
+            check_shape("betas", betas, (len(hand_pose), self.shapedirs.shape[-1]))
         skeleton = self.skeleton(betas, hand_pose, global_orient, wrist)
         vertices = self.skin(skeleton, hand_pose)
         joints = torch.cat([skeleton.joints, vertices[:, self.tip_vertex_ids]], dim=1)
@@ -148,11 +159,20 @@ class HandModel(nn.Module):
         """Finger rotations [..., 15, 3, 3] of mean-relative axis-angle [..., 15, 3] (flat_hand_mean=False).
 
         The mean pose is added to the rotation vectors, as the datasets' hand layers do, not composed.
+
+        Raises:
+            InputError: another shape.
         """
+        check_shape("hand_pose", hand_pose_aa, ("...", len(self.parents) - 1, 3))
         return axis_angle_to_matrix(hand_pose_aa + self.hands_mean)
 
     def pose_axis_angle(self, hand_pose: Tensor) -> Tensor:
-        """The mean-relative axis-angle [..., 15, 3] of finger rotations [..., 15, 3, 3]."""
+        """The mean-relative axis-angle [..., 15, 3] of finger rotations [..., 15, 3, 3].
+
+        Raises:
+            InputError: another shape.
+        """
+        check_shape("hand_pose", hand_pose, ("...", len(self.parents) - 1, 3, 3))
         return matrix_to_axis_angle(hand_pose) - self.hands_mean
 
     def mirrored(self) -> HandModel:

@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from trimesh.registration import icp
 
+from bigs.checks import check_shape
 from bigs.metrics.shape import MAX_POINTS, Chamfer, ShapeScore, chamfer, draw, shape_score
 
 # As many surface samples as the published evaluator aligns with.
@@ -63,7 +64,14 @@ def similarity_icp(
     Returns:
         The alignment with its score over all vertices, at most `bigs.metrics.shape.MAX_POINTS` of each shape.
         A shape without extent is only moved.
+
+    Raises:
+        InputError: another shape.
     """
+    for name, verts, faces in (("source", source, source_faces), ("target", target, target_faces)):
+        check_shape(name, verts, ("N", 3))
+        if faces is not None:
+            check_shape(f"{name}_faces", faces, ("F", 3))
     generator = torch.Generator().manual_seed(seed)
     source_samples = _sample(source, source_faces, generator, seed)
     target_samples = _sample(target, target_faces, generator, seed)

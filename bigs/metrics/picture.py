@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bigs.checks import check_shape
 from bigs.metrics.image import psnr, ssim, ssim_map
 from bigs.metrics.report import METRICS, Metric
 
@@ -62,7 +63,13 @@ def picture_scores(
 
     Returns:
         Scores by key; NaN for an empty mask.
+
+    Raises:
+        InputError: another shape.
     """
+    check_shape("render", render, ("H", "W", 3))
+    check_shape("image", image, render.shape)
+    check_shape("mask", mask, render.shape[:2])
     weights = torch.as_tensor(mask)[None]
     pred, gt = (
         torch.as_tensor(picture, dtype=torch.float32).permute(2, 0, 1)[None] for picture in (render, image)

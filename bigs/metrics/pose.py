@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bigs.checks import check_shape
+
 
 def mpjpe(pred: np.ndarray, gt: np.ndarray) -> np.ndarray:
     """Mean per-joint position error of each frame, each side relative to its own joint 0.
@@ -16,7 +18,11 @@ def mpjpe(pred: np.ndarray, gt: np.ndarray) -> np.ndarray:
 
     Returns:
         [T] millimetres.
+
+    Raises:
+        InputError: another shape.
     """
+    _check_joints(pred, gt)
     relative = (pred - pred[:, :1]) - (gt - gt[:, :1])
     return 1000.0 * np.linalg.norm(relative, axis=-1).mean(axis=-1)
 
@@ -34,7 +40,12 @@ def clip_scale(pred_points: np.ndarray, gt_points: np.ndarray) -> float:
 
     Returns:
         The scale, 1 when no finite point is left.
+
+    Raises:
+        InputError: another shape.
     """
+    check_shape("pred_points", pred_points, ("...", 3))
+    check_shape("gt_points", gt_points, pred_points.shape)
     finite = np.isfinite(pred_points).all(axis=-1) & np.isfinite(gt_points).all(axis=-1)
     pred, gt = pred_points[finite].astype(np.float64), gt_points[finite].astype(np.float64)
     energy = float(np.sum(pred * pred))
@@ -51,5 +62,14 @@ def wrist_error(pred: np.ndarray, gt: np.ndarray, scale: float = 1.0) -> np.ndar
 
     Returns:
         [T] millimetres.
+
+    Raises:
+        InputError: another shape.
     """
+    _check_joints(pred, gt)
     return 1000.0 * np.linalg.norm(scale * pred[:, 0] - gt[:, 0], axis=-1)
+
+
+def _check_joints(pred: np.ndarray, gt: np.ndarray) -> None:
+    check_shape("pred", pred, ("T", "J", 3))
+    check_shape("gt", gt, pred.shape)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_shape
 
 # The evaluators draw this many vertices of each set in every frame (vertices, not surface samples).
 POINTS_PER_FRAME = 3000
@@ -112,6 +112,7 @@ def draw(points: np.ndarray, count: int, generator: torch.Generator) -> np.ndarr
 def _nearest_cm(p: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances in centimetres from each point of `p` to `g`, and from each point of `g` to `p`."""
     for name, points in (("predicted points", p), ("true points", g)):
+        check_shape(name, points, ("N", 3))
         if len(points) == 0:
             raise InputError(f"{name}: expected at least one point, found none")
     p_to_g, _ = cKDTree(g).query(p)

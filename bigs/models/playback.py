@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bigs.checks import InputError
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
@@ -131,15 +132,23 @@ class Playback:
         return Gaussians(splats.points, splats.quats, splats.scales, splats.opacities, splats.colors)
 
     def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
-        """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours."""
-        index = torch.as_tensor(list(frames))
+        """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours.
+
+        Raises:
+            InputError: a frame that the clip has not.
+        """
+        index = self._index(frames)
         return concatenate(
             self._posed(entity, index) for entity in (self.entities if entities is None else entities)
         )
 
     def at(self, frames: Iterable[int]) -> Playback:
-        """Some frames as a playback of their own."""
-        index = torch.as_tensor(list(frames))
+        """Some frames as a playback of their own.
+
+        Raises:
+            InputError: a frame that the clip has not.
+        """
+        index = self._index(frames)
         hands, obj = dict(self.hands), self.object
         for side, hand in hands.items():
             moving = {name: getattr(hand, name)[index] for name in _MOVING_HAND}
@@ -150,6 +159,13 @@ class Playback:
             obj = replace(obj, **{name: getattr(obj, name)[index] for name in _MOVING_OBJECT})
         names = tuple(self.frame_names[t] for t in index.tolist())
         return replace(self, frame_names=names, hands=hands, object=obj)
+
+    def _index(self, frames: Iterable[int]) -> Tensor:
+        numbers = [int(frame) for frame in frames]
+        for frame in numbers:
+            if not 0 <= frame < len(self):
+                raise InputError(f"frames: expected numbers from 0 to {len(self) - 1}, found {frame}")
+        return torch.tensor(numbers, dtype=torch.int64)
 
     def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
         subject = self.object if entity == "object" else self.hands[entity]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from bigs.checks import check_choice, check_shape
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand import JOINT_NAMES, MANO_PARENTS, mirror_axis_angle, mirror_points, skin_points
 from bigs.hand.lbs import forward_kinematics
@@ -42,7 +43,13 @@ def repose(
     Returns:
         A hand whose every field fits the new poses, except that the mesh keeps the pose correctives it had.
         (The Gaussians' are evaluated anew.)
+
+    Raises:
+        InputError: another shape.
     """
+    check_shape("hand_pose", hand_pose, ("T", 15, 3, 3))
+    check_shape("global_orient", global_orient, (len(hand_pose), 3, 3))
+    check_shape("wrist", wrist, (len(hand_pose), 3))
     rotations = torch.cat([global_orient[:, None], hand_pose], dim=1)
     joints, bones = forward_kinematics(rotations, hand.rest_joints, MANO_PARENTS, wrist)
     left = side == "left"
@@ -76,7 +83,12 @@ def bend_fingers(hand: HandPlayback, side: Side, degrees: Mapping[str, float]) -
         hand: to bend.
         side: which hand it is.
         degrees: a name of `FINGERS` -> by how much each of its three joints is bent; negative stretches.
+
+    Raises:
+        InputError: a finger that no hand has.
     """
+    for finger in degrees:
+        check_choice("finger", finger, FINGERS)
     pose = hand.hand_pose.clone()
     for finger, angle in degrees.items():
         for joint, axis in zip(FINGERS[finger], _bending_axes(hand, finger), strict=True):
@@ -85,7 +97,12 @@ def bend_fingers(hand: HandPlayback, side: Side, degrees: Mapping[str, float]) -
 
 
 def turn_object(obj: ObjectPlayback, rotation: Tensor) -> ObjectPlayback:
-    """Turn the object by `rotation` [3, 3], in its own axes about the middle of its mesh, in every frame."""
+    """Turn the object by `rotation` [3, 3], in its own axes about the middle of its mesh, in every frame.
+
+    Raises:
+        InputError: another shape.
+    """
+    check_shape("rotation", rotation, (3, 3))
     middle = obj.verts.mean(0)
     shift = obj.scale * (obj.rotations @ (middle - rotation @ middle))
     return replace(obj, rotations=obj.rotations @ rotation, centers=obj.centers + shift)

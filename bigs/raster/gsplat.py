@@ -19,6 +19,21 @@ from bigs.raster.sh import spherical_harmonics
 
 __all__ = ["rasterization", "spherical_harmonics"]
 
+# Why what is not here is not.
+_WHY = {
+    "sparse_grad": "gradients are dense",
+    "distributed": "one process renders everything",
+    "covars": "shapes are given as quats and scales",
+    "with_ut": "Gaussians are projected by a linear map, not by an unscented transform",
+    "with_eval3d": "Gaussians are evaluated in the image, not in space",
+    "radial_coeffs": "images are to be without distortion",
+    "tangential_coeffs": "images are to be without distortion",
+    "thin_prism_coeffs": "images are to be without distortion",
+    "ftheta_coeffs": "cameras are pinhole or ortho",
+    "rolling_shutter": "all rows of an image are taken at once",
+    "viewmats_rs": "all rows of an image are taken at once",
+}
+
 
 def rasterization(
     means: torch.Tensor,  # [..., N, 3]
@@ -77,6 +92,7 @@ def rasterization(
     Raises:
         InputError: an argument that is not supported, or one that cannot be rendered.
     """
+    check_choice("camera_model", camera_model, ("pinhole", "ortho"))
     _refuse(
         sparse_grad=sparse_grad,
         distributed=distributed,
@@ -91,7 +107,6 @@ def rasterization(
         viewmats_rs=viewmats_rs,
     )
     check_choice("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
-    check_choice("camera_model", camera_model, ("pinhole", "ortho"))
     settings = RasterSettings(
         tile_size=tile_size,
         eps2d=eps2d,
@@ -124,9 +139,7 @@ def rasterization(
 def _refuse(**arguments: Any) -> None:
     for name, value in arguments.items():
         if value is not None and value is not False:
-            raise InputError(
-                f"{name}: expected gsplat's default, found another value, which bigs cannot render"
-            )
+            raise InputError(f"{name}: expected gsplat's default because {_WHY[name]}, found another value")
 
 
 def _meta(info: dict[str, Any], opacities: torch.Tensor, packed: bool) -> dict[str, Any]:
