@@ -10,7 +10,7 @@ ALL_EXTRAS := dev,synthetic,video,bench,diffusion,segment,viewer,export,rerun,sl
 # Processes that share the tests; each works on one thread.
 TEST_WORKERS ?= 2
 
-.PHONY: setup setup-all demo test lint test-rust test-python bench wheel clean
+.PHONY: setup setup-all demo test lint test-rust test-python fuzz bench wheel clean
 
 setup: $(BIN)/bigs
 
@@ -45,6 +45,11 @@ test-rust:
 
 test-python:
 	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist worksteal
+
+# Damaged files of every kind before the command line, for so many seconds.
+FUZZ_SECONDS ?= 300
+fuzz: setup
+	$(BIN)/python -m tests.fuzzing --seconds $(FUZZ_SECONDS)
 
 bench: setup
 	cargo bench -p bigs-raster-checks

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,13 @@ MAX_MEMBERS = 10_000
 
 # Others unpack in steps whose size nobody bounds.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_HEADER_ERRORS: tuple[type[Exception], ...] = (*ARCHIVE_ERRORS, SyntaxError, TypeError, MemoryError)
+_HEADER_ERRORS: tuple[type[Exception], ...] = (
+    *ARCHIVE_ERRORS,
+    SyntaxError,
+    tokenize.TokenError,
+    TypeError,
+    MemoryError,
+)
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,

@@ -219,6 +219,14 @@ def zipped(path: Path, members: dict[str, bytes], method: int = zipfile.ZIP_DEFL
     return path
 
 
+@pytest.mark.parametrize("text", [b"{", b"{'descr': (", b'"""', b"[" * 5000, b"\\", b"{'descr': 1}"])
+def test_headers_that_are_no_python(tmp_path: Path, text: bytes) -> None:
+    header = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    path = zipped(tmp_path / "gt.npz", {"K.npy": header})
+    with pytest.raises(InputError, match=r"gt.npz: 'K': expected an .npy array, found"):
+        read_npz(path, "ground truth")
+
+
 @pytest.mark.parametrize("name", ["gt.npz", "poses.npz", "MANO_RIGHT.npz"])
 def test_archives_that_unpack_to_too_much(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert archives.MAX_UNPACKED_BYTES < 1 << 29

@@ -8,7 +8,9 @@ import sys
 from collections.abc import Callable
 
 import pytest
-from command_line import Answer
+from command_line import Answer, assert_refused
+
+from bigs.checks import InputError
 
 
 @pytest.mark.parametrize("arguments", [("--debug", "doctor"), ("doctor", "--debug"), ("doctor",)])
@@ -48,3 +50,22 @@ def test_an_output_that_nobody_reads(closed: str) -> None:
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_no_text_of_a_file_steers_the_terminal(
+    call: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails() -> None:
+        raise InputError("a\nb\x1b[31m\u202e\ud800 :heart: [red] é" + "x" * 100_000)
+
+    monkeypatch.setattr("bigs.commands.doctor.examine", fails)
+    answer = call("doctor")
+    assert answer.code == 2 and answer.err.count("\n") == 1 and len(answer.err) < 2000
+    assert answer.err.startswith("bigs: a\\nb\\x1b[31m\\u202e\\ud800 :heart: [red] éxxx")
+    monkeypatch.setattr("bigs.commands.doctor.examine", lambda: [("\x1b[31m :heart:", [])])
+    assert call("doctor").out == "\\x1b[31m :heart::\n"
+
+
+@pytest.mark.parametrize("threads", ["-1", "4097", "9" * 400])
+def test_threads_that_no_machine_has(call: Callable[..., Answer], threads: str) -> None:
+    assert_refused(call("render", "run", "--threads", threads), "--threads: expected 0 to 4096")

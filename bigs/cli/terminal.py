@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 import tyro
 from rich.console import Console
 
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 
 # What a command works on, as its help calls it.
 ClipPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
@@ -28,6 +28,10 @@ Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 
 # A file or a pipe has no width; tables there are as wide as they need to be.
 _WIDTH_OF_A_FILE = 240
+# More of an error's text is no sentence.
+_LONGEST_LINE = 1500
+# No machine has more processors; each thread takes memory.
+_MOST_THREADS = 4096
 
 
 class _Output(Console):
@@ -63,7 +67,15 @@ stderr = _Output(stderr=True)
 
 def say(text: str) -> None:
     """A line on standard output, as it is: nothing coloured, nothing wrapped."""
-    stdout.print(text, markup=False, highlight=False, soft_wrap=True)
+    stdout.print(plain(text), markup=False, highlight=False, emoji=False, soft_wrap=True)
+
+
+def plain(text: str) -> str:
+    """Text without anything that would steer a terminal, as names from a file may have it.
+
+    What does not print, but for the ends of lines, is shown as Python writes it.
+    """
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager
@@ -77,14 +89,18 @@ def until_nobody_reads() -> Iterator[None]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    stderr.print(f"bigs: {message}", markup=False, highlight=False, soft_wrap=True)
+    """End with one line on standard error, whatever a file has put into the message."""
+    line = plain(message.replace("\n", "\\n"))
+    if len(line) > _LONGEST_LINE:
+        line = f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 2 :]}"
+    stderr.print(f"bigs: {line}", markup=False, highlight=False, emoji=False, soft_wrap=True)
     sys.exit(code)
 
 
 def use_threads(threads: int) -> None:
     """Limit both thread pools; the engine's reads its variable when it is first used."""
-    if threads < 0:
-        raise InputError(f"--threads: expected 0 or more, found {threads}")
+    if not 0 <= threads <= _MOST_THREADS:
+        raise InputError(f"--threads: expected 0 to {_MOST_THREADS}, found {shown(threads)}")
     if threads:
         os.environ["RAYON_NUM_THREADS"] = str(threads)
         import torch

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -116,7 +117,8 @@ def state_of(path: Path, inputs: str) -> State:
     stored = _read_json(path) if path.suffix == ".json" else _read_npz(path, ("version", "inputs"))
     if not str(stored.get("inputs", "")):
         return "supplied"
-    current = int(stored.get("version", 0)) == VERSION and str(stored["inputs"]) == inputs
+    # As text, for whatever may stand there.
+    current = str(stored.get("version")) == str(VERSION) and str(stored["inputs"]) == inputs
     return "current" if current else "outdated"
 
 
@@ -142,7 +144,15 @@ def read_frame_set(processed: Path) -> FrameSet:
     K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise InputError(f"{file}: K: expected positive focal lengths over (0, 0, 1), found {K.tolist()}")
-    source_width, source_height = stored.get("source_size", (0, 0))
+    source = {
+        key: _counts(f"{file}: {key}", stored.get(key, absent), shape)
+        for key, absent, shape in (
+            ("source_frames", [], ("T",)),
+            ("source_length", 0, ()),
+            ("source_size", (0, 0), (2,)),
+        )
+    }
+    source_width, source_height = source["source_size"].tolist()
     return FrameSet(
         names=tuple(names),
         fps=size["fps"],
@@ -151,9 +161,9 @@ def read_frame_set(processed: Path) -> FrameSet:
         K=K,
         camera=str(stored.get("camera", "supplied")),
         focal_known=bool(stored.get("focal_known", True)),
-        source_frames=tuple(int(frame) for frame in stored.get("source_frames", ())),
-        source_length=int(stored.get("source_length", 0)),
-        source_size=(int(source_width), int(source_height)),
+        source_frames=tuple(source["source_frames"].tolist()),
+        source_length=int(source["source_length"]),
+        source_size=(source_width, source_height),
     )
 
 
@@ -341,7 +351,7 @@ def _fields_of(path: Path, stored: Mapping[str, Any], prefix: str) -> Any:
 def _add_path(found: Any, path: Path) -> None:
     if path.is_dir():
         for file in sorted(p for p in path.rglob("*") if p.is_file() and not p.name.startswith(".")):
-            found.update(b"name" + str(file.relative_to(path)).encode() + b"\0")
+            found.update(b"name" + os.fsencode(file.relative_to(path)) + b"\0")
             _add_path(found, file)
     elif path.is_file():
         with path.open("rb") as stream:
@@ -356,6 +366,14 @@ def _numbered(folder: Path, count: int) -> list[Path]:
     if missing:
         raise InputError(f"{missing[0]}: expected an image for each of {count} frames, found no such file")
     return paths
+
+
+def _counts(where: str, value: Any, shape: Sequence[int | str]) -> np.ndarray:
+    """Whole numbers of 0 or more."""
+    counts = array_field(where, value, shape)
+    if (counts < 0).any() or (counts != np.floor(counts)).any():
+        raise InputError(f"{where}: expected whole numbers of 0 or more, found {shown(value)}")
+    return counts.astype(int)
 
 
 def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:

@@ -11,6 +11,8 @@ import numpy as np
 from bigs.checks import InputError, found_at
 from bigs.colmap import pycolmap
 from bigs.data.arctic import camera_of_images
+from bigs.data.colmap_files import check_model_files
+from bigs.data.fields import LARGEST, array_field
 from bigs.preprocess.source import Source
 
 # Without any knowledge the focal length is taken to be this many times the longer side (46 degrees across).
@@ -56,14 +58,14 @@ def find_camera(request: CameraRequest, source: Source, width: int, height: int)
         raise InputError(f"camera: expected one of K, focal and colmap, found {' and '.join(given)}")
     if request.K is not None:
         fx, fy, cx, cy = request.K
-        if min(fx, fy) <= 0 or not (0 <= cx <= width and 0 <= cy <= height):
+        if not (min(fx, fy) > 0 and max(fx, fy) < LARGEST and 0 <= cx <= width and 0 <= cy <= height):
             raise InputError(
                 "K: expected fx fy cx cy with positive focal lengths and the centre within "
                 f"{width} x {height}, found {fx:g} {fy:g} {cx:g} {cy:g}"
             )
         return Camera(_matrix(fx, fy, cx, cy), "given as K", True)
     if request.focal is not None:
-        if not request.focal > 0:
+        if not 0 < request.focal < LARGEST:
             raise InputError(f"focal: expected a positive number of pixels, found {request.focal:g}")
         return Camera(_centred(request.focal, width, height), "given as focal length", True)
     if request.colmap is not None:
@@ -101,9 +103,10 @@ def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     """The first camera of a COLMAP model; another image size of the same proportions is scaled."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected the folder of a COLMAP model, found {found_at(folder)}")
+    check_model_files(folder)
     try:
         cameras = pycolmap.Reconstruction(str(folder)).cameras
-    except (ValueError, RuntimeError, OSError) as error:
+    except Exception as error:  # pycolmap raises what its C++ throws
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
             f"{folder}: expected a COLMAP model (cameras, images, points3D), found {reason}"
@@ -111,10 +114,15 @@ def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     if not cameras:
         raise InputError(f"{folder}: expected a COLMAP model with a camera, found none in it")
     camera = cameras[min(cameras)]
+    K = array_field(f"{folder}: camera", camera.calibration_matrix(), (3, 3))
+    if min(camera.width, camera.height) < 1 or min(K[0, 0], K[1, 1]) <= 0:
+        raise InputError(
+            f"{folder}: camera: expected a size and positive focal lengths, found {camera.width} x "
+            f"{camera.height} and {K[0, 0]:g}, {K[1, 1]:g}"
+        )
     factors = _factors(str(folder), (camera.width, camera.height), width, height)
     bent = "" if len(camera.params) <= 4 and "RADIAL" not in camera.model.name else ", distortion left out"
-    K = scale_camera(np.asarray(camera.calibration_matrix(), dtype=np.float64), *factors)
-    return Camera(K, f"from COLMAP ({camera.model.name}{bent})", True)
+    return Camera(scale_camera(K, *factors), f"from COLMAP ({camera.model.name}{bent})", True)
 
 
 def _factors(where: str, own: tuple[int, int], width: int, height: int) -> tuple[float, float]:

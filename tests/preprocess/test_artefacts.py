@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,3 +174,36 @@ def test_damaged_files_are_refused_in_a_sentence(tmp_path: Path) -> None:
     write_frame_set(tmp_path, replace(FRAME_SET, K=np.zeros((3, 3))), "x")
     with pytest.raises(InputError, match="K: expected positive focal lengths"):
         read_frame_set(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("source_size", 3),
+        ("source_size", [1, None]),
+        ("source_frames", None),
+        ("source_frames", [0.5]),
+        ("source_length", "many"),
+        ("source_length", -1),
+        ("width", [1]),
+        ("fps", float("nan")),
+    ],
+)
+def test_every_field_of_the_frames_is_checked(tmp_path: Path, field: str, value: object) -> None:
+    write_frame_set(tmp_path, FRAME_SET, "digest")
+    file = tmp_path / "frames.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {field: value}))
+    with pytest.raises(InputError, match=f"frames.json: {field}: expected"):
+        read_frame_set(tmp_path)
+
+
+@pytest.mark.parametrize("version", [None, [1], "one", 10**90])
+def test_a_version_that_is_none_is_out_of_date(tmp_path: Path, version: object) -> None:
+    file = tmp_path / "masks.json"
+    file.write_text(json.dumps({"version": version, "inputs": "digest"}))
+    assert state_of(file, "digest") == "outdated"
+
+
+def test_a_name_that_is_no_text_has_a_digest(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"\xff.png")).write_bytes(b"")
+    assert content_digest(tmp_path) != content_digest(tmp_path / "nothing")

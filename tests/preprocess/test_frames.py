@@ -194,11 +194,41 @@ def test_4k_is_shrunk_unless_it_is_to_be_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "before", "after", "words"),
+    [
+        (
+            "cameras.txt",
+            "300",
+            "-300",
+            "camera: expected a size and positive focal lengths, found 96 x 64 and -300",
+        ),
+        ("cameras.txt", "300", "nan", "expected a COLMAP model"),
+        ("cameras.txt", "PINHOLE", "PINBALL", "expected a COLMAP model"),
+        ("cameras.bin", "", "\x09", "cameras.bin: expected a whole file, found that it ends within entry 0"),
+    ],
+)
+def test_a_colmap_camera_that_took_no_picture(
+    folder: Path, tmp_path: Path, name: str, before: str, after: str, words: str
+) -> None:
+    model = tmp_path / "sparse"
+    model.mkdir()
+    files = {"cameras.txt": "1 PINHOLE 96 64 300 300 48 32\n", "images.txt": "", "points3D.txt": ""}
+    for file, content in files.items():
+        (model / file).write_text(content)
+    (model / name).write_text(files.get(name, "").replace(before, after, 1))
+    with pytest.raises(InputError) as caught:
+        extract(folder, tmp_path / "out", camera=CameraRequest(colmap=model))
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"stride": 5}, "expected at least 4 frames, found 2 of 10 pictures"),
         ({"stride": 0}, "stride: expected an integer of at least 1, found 0"),
         ({"camera": CameraRequest(focal=-3.0)}, "focal: expected a positive number"),
+        ({"camera": CameraRequest(focal=1e300)}, "focal: expected a positive number"),
+        ({"camera": CameraRequest(K=(1e300, 100, 50, 10))}, "positive focal lengths"),
         ({"camera": CameraRequest(focal=3.0, K=(1, 1, 1, 1))}, "expected one of K, focal and colmap"),
         ({"camera": CameraRequest(K=(100, 100, 500, 10))}, "the centre within 96 x 64"),
         ({"camera": CameraRequest(colmap=Path("nowhere"))}, "nowhere: expected the folder of a COLMAP model"),
