@@ -83,7 +83,8 @@ def fist(model: HandModel, amount: Tensor) -> Tensor:
     In MANO's axes the fingers point to -x and the palm to -y, so a finger bends about +z.
     """
     bend = torch.zeros(len(amount), 15, 3)
-    bend[:, :12, 2] = math.radians(75) * amount[:, None]  # index, middle, pinky, ring
+    knuckle, middle, tip = math.radians(85), math.radians(105), math.radians(75)
+    bend[:, :12, 2] = torch.tensor([knuckle, middle, tip]).repeat(4) * amount[:, None]
     bend[:, 12, 0] = math.radians(45) * amount  # the thumb turns in front of the palm
     bend[:, 13:, :2] = math.radians(30) * amount[:, None, None] * torch.tensor([0.8, -0.6])
     return model.pose_matrices(bend - model.hands_mean)

@@ -63,9 +63,14 @@ def main(out: Path = Path("example_out"), count: int = 10_000, width: int = 320,
 
 def trefoil(count: int, thickness: float = 0.28) -> Gaussians:
     """`count` discs, evenly spread, on a tube around a trefoil knot of about unit radius."""
-    # The plane's evenest additive sequence; random places would leave holes.
+    # A spiral that turns by the golden angle, at even steps of length: the same on a long tube as on
+    # a short one. Random places, or even steps of the angle, would leave holes where the tube is stretched.
+    angles = torch.linspace(0, 2 * math.pi, 4097)
+    lengths = (_knot(angles[1:]) - _knot(angles[:-1])).norm(dim=-1).cumsum(0)
     index = torch.arange(count, dtype=torch.float64)
-    along, around = ((2 * math.pi * (index * step % 1)).float() for step in (0.7548776662, 0.5698402910))
+    wanted = ((index + 0.5) / count * lengths[-1]).float()
+    along = angles[1:][torch.searchsorted(lengths, wanted).clamp(max=len(lengths) - 1)]
+    around = (2 * math.pi * (index * 0.6180339887 % 1)).float()
     eps = 1e-3
     tangent = torch.nn.functional.normalize(_knot(along + eps) - _knot(along - eps), dim=-1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(tangent)
@@ -74,7 +79,8 @@ def trefoil(count: int, thickness: float = 0.28) -> Gaussians:
     frames = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=-1)
     hue = 0.5 + 0.5 * torch.cos(along[:, None] + torch.tensor([0.0, 2.1, 4.2]))
     shade = 0.55 + 0.45 * normal[:, 2:]
-    sigma = 2.6 / math.sqrt(count)
+    # Each disc has so much of the tube's surface to itself, more on the outside of a bend.
+    sigma = 0.8 * math.sqrt(2 * math.pi * thickness * float(lengths[-1]) / count)
     return Gaussians(
         means=_knot(along) + thickness * normal,
         quats=matrix_to_quat(frames),
