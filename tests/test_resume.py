@@ -16,11 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import Answer, Run, run_bigs
+from command_line import Answer, Run, assert_refused, run_bigs
 from family import Family
 from safetensors.numpy import load_file
 
-from bigs.commands.reconstruct import reconstruct
+from bigs.checks import InputError
+from bigs.commands.reconstruct import reconstruct, run_origin
+from bigs.commands.same_options import check_same_options
+from bigs.train.config_file import save_config
 from bigs.train.presets import PRESETS
 
 pytestmark = pytest.mark.slow
@@ -103,3 +106,35 @@ def test_before_the_first_checkpoint_options_may_change(tiny_clip: Path, tmp_pat
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["config"]["seed"] == 3
     events = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert [e["step"] for e in events if e["event"] == "step"] == [1, 2]
+
+
+def test_another_option_is_named_with_both_values(
+    call: Callable[..., Answer], finished_run: Run, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    (out / "checkpoints").mkdir(parents=True)
+    for name in ("config.yaml", "checkpoints/latest.safetensors"):
+        (out / name).write_bytes((finished_run.folder / name).read_bytes())
+    command = [*finished_run.command[:4], "--out", out, "--resume"]
+    answer = call(*command, "--set", "seed=7")
+    assert_refused(answer, "--set seed: expected 0, as the run has it, found 7", "--config", "another --out")
+    answer = call(*command, "--set", "seed=7", "--set", "stages.joint.steps=99")
+    assert_refused(answer, "--set seed: expected 0", "and 1 more setting")
+
+
+def test_another_preset_is_named(tmp_path: Path) -> None:
+    origin = run_origin(tmp_path, None)
+    save_config(tmp_path / "config.yaml", PRESETS["smoke"], origin)
+    check_same_options(tmp_path, PRESETS["smoke"], origin)
+    with pytest.raises(InputError, match="--preset: expected smoke, as the run has it, found fast"):
+        check_same_options(tmp_path, PRESETS["fast"], origin)
+    with pytest.raises(InputError, match=r"--hand-model: expected the built-in hand, .* found .*mano"):
+        check_same_options(tmp_path, PRESETS["smoke"], run_origin(tmp_path, tmp_path / "mano"))
+    with pytest.raises(InputError, match=r"expected a run of bigs 99, found one of "):
+        check_same_options(tmp_path, PRESETS["smoke"], {**origin, "bigs": "99"})
+
+
+def test_files_that_have_moved_are_no_other_options(tmp_path: Path) -> None:
+    origin = run_origin(tmp_path, None)
+    save_config(tmp_path / "config.yaml", PRESETS["smoke"], origin)
+    check_same_options(tmp_path, replace(PRESETS["smoke"], perceptual_weights=("vgg.pth",)), origin)

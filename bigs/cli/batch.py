@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import tyro
 
 from bigs.checks import InputError, check_choice
-from bigs.cli.terminal import Preset, fail_for, print_table, say, settings_of, stderr
+from bigs.cli.terminal import Preset, fail_for, print_table, say, settings_of, telling
 
 if TYPE_CHECKING:
     from bigs.commands.engines import Engine
@@ -90,8 +90,8 @@ def batch(
             return SlurmJobs(out / "slurm", threads, options, slurm_cluster)
         return RayCluster(workers, threads, ray_address) if engine == "ray" else Processes()
 
-    with stderr.status("starting") as status:
-        result = run_batch(plan, start, workers, listen=status.update)
+    with telling() as tell:
+        result = run_batch(plan, start, workers, listen=tell)
     print_table(result.table)
     for name, why in result.failed.items():
         say(f"{name}: {why}")

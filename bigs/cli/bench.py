@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bigs.cli.terminal import Preset, fail_for, print_tables, stderr, use_threads
+from bigs.cli.terminal import Preset, fail_for, print_tables, telling, use_threads
 
 # The names of `bench.workloads.KINDS`, `bench.plan.PARTS` and `bench.peers.PEERS`; a test compares.
 Workload = Literal["A", "B", "C", "D"]
@@ -42,7 +42,7 @@ def bench_engine(
     """
     from bigs.commands.bench import bench_engine as run
 
-    with stderr.status("starting") as status:
+    with telling() as tell:
         tables = run(
             out,
             workloads,
@@ -53,7 +53,7 @@ def bench_engine(
             peers=peers,
             repeats=repeats,
             budget=budget,
-            listen=status.update,
+            listen=tell,
         )
     print_tables(tables, out)
 
@@ -91,8 +91,8 @@ def bench_reconstruct(
     from bigs.commands.bench_reconstruct import bench_reconstruct as run
 
     plan = RunPlan(clips, presets, without, steps_limit, hand_model, frames, growth_steps)
-    with stderr.status("starting") as status:
-        found = run(plan, out, picture=picture, listen=status.update)
+    with telling() as tell:
+        found = run(plan, out, picture=picture, listen=tell)
     print_tables([table for table in found.tables if table.title in BRIEF], out)
     fail_for(found.failed)
 
@@ -121,8 +121,8 @@ def bench_preprocess(
     from bigs.commands.preprocess_variants import VARIANTS
 
     plan = PreprocessPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
-    with stderr.status("starting") as status:
-        found = run(plan, out, status.update)
+    with telling() as tell:
+        found = run(plan, out, tell)
     print_tables(found.tables, out)
     fail_for(found.failed)
 
@@ -153,8 +153,8 @@ def bench_robustness(
     from bigs.commands.clip_damage import DAMAGES
 
     plan = RobustnessPlan(clips, damages or tuple(DAMAGES), preset, hand_model, seed)
-    with stderr.status("starting") as status:
-        found = run(plan, out, status.update)
+    with telling() as tell:
+        found = run(plan, out, tell)
     print_tables(found.tables, out)
     fail_for(found.failed)
 
@@ -184,6 +184,6 @@ def bench_adjustment(
     from bigs.commands.bench_adjustment import bench_adjustment as run
 
     plan = AdjustmentPlan(frames, points, seen, iterations, seed)
-    with stderr.status("starting") as status:
-        tables = run(plan, out, status.update)
+    with telling() as tell:
+        tables = run(plan, out, tell)
     print_tables(tables, out)

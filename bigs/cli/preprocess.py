@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from bigs.checks import InputError, found_at
-from bigs.cli.terminal import say, stderr, use_threads
+from bigs.cli.terminal import say, telling, use_threads
 
 if TYPE_CHECKING:
     from bigs.commands.preprocess_request import PreprocessRequest, StepName, StepOutcome
@@ -285,9 +285,8 @@ def _run(request: PreprocessRequest, steps: tuple[StepName, ...] | None) -> None
     from bigs.commands.preprocess import preprocess as run
     from bigs.commands.preprocess_request import STEPS
 
-    with stderr.status("starting") as status:
-        for outcome in run(request, STEPS if steps is None else steps, status.update):
-            _tell(outcome)
+    with telling() as tell:
+        run(request, STEPS if steps is None else steps, tell, _tell)
 
 
 def _tell(outcome: StepOutcome) -> None:

@@ -20,6 +20,7 @@ from bigs.cli.terminal import (
     say,
     settings_of,
     stderr,
+    telling,
     use_threads,
 )
 
@@ -69,7 +70,7 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
     """Make a little clip of two hands and a bottle, reconstruct it, and show how much better it became.
 
     Args:
-        out: folder for the clip and the run; must not hold an earlier demo.
+        out: the run folder to make, with the clip in its folder clip; must be new or empty.
         preset: how much work to put in.
         threads: CPU threads; 0 takes all.
         seed: of the clip and of the reconstruction.
@@ -220,8 +221,8 @@ def render(
 
     shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
     wanted = Wanted(out, video, depth, background_of(background))
-    with stderr.status("starting") as status:
-        files = render_run(run, shot, wanted, status.update)
+    with telling() as tell:
+        files = render_run(run, shot, wanted, tell)
     rendered = sum(path.parent == out for path in files)
     if out is not None:
         beside = "" if depth is None else f", their depth in {out / 'depth'}"
@@ -297,7 +298,7 @@ def view(
     """
     from bigs.commands.view import view as serve
 
-    with stderr.status("starting"):
+    with telling():
         viewer = serve(run, host, port, clip=clip, gt=gt)
     with viewer, contextlib.suppress(KeyboardInterrupt):
         say(f"{viewer.url} (Ctrl-C ends)")
@@ -334,7 +335,7 @@ def ablate(
     from bigs.commands.ablate import default_rows
 
     settings = settings_of(preset, config, set, default="fast")
-    with stderr.status("starting") as status:
+    with telling() as tell:
         found = run(
             clip,
             out,
@@ -342,7 +343,7 @@ def ablate(
             default_rows() if rows is None else rows,
             hand_model=hand_model,
             ground_truth=gt,
-            listen=status.update,
+            listen=tell,
         )
     print_tables([found.table], out)
     fail_for(found.failed)
@@ -357,5 +358,5 @@ def show(outcome: Outcome) -> None:
         say(f"recovered: {line}")
     print_table(outcome.table)
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.report.seconds.items())
-    say(f"{outcome.seconds:.0f} s in all: {times}")
+    say(f"{outcome.seconds:.1f} s in all: {times}")
     say(f"results in {outcome.run}: see preview.png and report.html")

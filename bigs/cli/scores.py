@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from bigs.checks import InputError
-from bigs.cli.terminal import print_table, print_tables, say, stderr, use_threads
+from bigs.cli.terminal import print_table, print_tables, say, telling, use_threads
 
 
 def evaluate(
@@ -47,8 +47,8 @@ def evaluate(
             raise InputError(f"{option}: expected one run with it, found {len(runs)}")
     plan = EvaluationPlan(gt, clip, novel, hand_model, perceptual_weights)
     names = run_names(runs)
-    with stderr.status("starting") as status:
-        found = {name: evaluate_run(run, plan, status.update) for name, run in zip(names, runs, strict=True)}
+    with telling() as tell:
+        found = {name: evaluate_run(run, plan, tell) for name, run in zip(names, runs, strict=True)}
     for name, evaluation in found.items():
         for line in evaluation.remarks:
             say(f"{name}: {line}")

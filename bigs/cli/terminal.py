@@ -6,7 +6,8 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -14,6 +15,7 @@ import tyro
 from rich.console import Console
 
 from bigs.checks import InputError, shown
+from bigs.commands.spoken import spoken
 
 # What a command works on, as its help calls it.
 ClipPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
@@ -86,6 +88,17 @@ def until_nobody_reads() -> Iterator[None]:
     except BrokenPipeError:
         stdout.on_broken_pipe()
         sys.exit(0)
+
+
+@contextmanager
+def telling() -> Iterator[Callable[[str], None]]:
+    """Shows what is being done, as the block tells it; in lines where there is no terminal."""
+    if stderr.is_terminal:
+        with stderr.status("starting") as status:
+            yield status.update
+    else:
+        with spoken(stderr) as lines:
+            yield lines.update
 
 
 def fail(message: str, code: int) -> NoReturn:

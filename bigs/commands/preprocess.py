@@ -9,6 +9,7 @@ from bigs.commands.preprocess_object import align_step, object_step
 from bigs.commands.preprocess_request import STEPS, PreprocessRequest, StepName, StepOutcome
 from bigs.commands.preprocess_steps import (
     build_step,
+    check_mask_source,
     frames_step,
     hand_source,
     hands_step,
@@ -29,6 +30,7 @@ def preprocess(
     request: PreprocessRequest,
     steps: tuple[StepName, ...] = STEPS,
     listen: Callable[[str], None] = lambda text: None,
+    tell: Callable[[StepOutcome], None] = lambda outcome: None,
 ) -> list[StepOutcome]:
     """Run steps in their order.
 
@@ -36,6 +38,7 @@ def preprocess(
         request: what the user gave.
         steps: which; each needs the artefacts of the ones before it.
         listen: told what is going on.
+        tell: told what became of each step when it is done.
 
     Returns:
         What became of each step.
@@ -44,15 +47,19 @@ def preprocess(
         InputError: bad input, in one sentence.
     """
     outcomes = []
+    if len(steps) > 1:
+        # What a later step lacks is said now, not after the minutes that earlier ones take.
+        if "masks" in steps:
+            check_mask_source(request)
+        if "hands" in steps:
+            hand_source(request)
     for name in STEPS:
         if name in steps:
-            if name == "object" and "hands" in steps:
-                # Said now, not after the minutes that this step takes.
-                hand_source(request)
             listen(name)
             began = time.perf_counter()
             outcome = RUN[name](request, _under_name(name, listen))
             outcomes.append(outcome._replace(seconds=time.perf_counter() - began))
+            tell(outcomes[-1])
     return outcomes
 
 

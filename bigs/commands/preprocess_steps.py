@@ -89,7 +89,7 @@ def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     if request.masks is None and request.sam2 is None:
         if request.mask_labels or request.clicks is not None:
             raise InputError("--mask-labels, --clicks: expected --masks or --sam2 with them, found neither")
-        return _supplied_masks(processed, frames, picture)
+        return _supplied_masks(request, frames, picture)
     if request.masks is not None:
         inputs, label_source = _given_masks(request, frames)
     else:
@@ -224,17 +224,30 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     return StepOutcome("build", "made", summary, (), picture)
 
 
-def _supplied_masks(processed: Path, frames: FrameSet, picture: Path) -> StepOutcome:
+def check_mask_source(request: PreprocessRequest) -> None:
+    """Whether there is anything that masks can come from.
+
+    Raises:
+        InputError: nothing was given and nothing is there, or what was given is no folder.
+    """
+    made = request.processed / MASKS
+    if request.masks is not None and not request.masks.is_dir():
+        raise InputError(f"{request.masks}: expected a folder of masks, found {found_at(request.masks)}")
+    if request.masks is None and request.sam2 is None and not made.is_dir():
+        raise InputError(
+            f"{made}: expected masks of hands and object, found none; give --masks DIR, "
+            "or --sam2 DIR with --clicks FILE (bigs preprocess frames extracts the frames alone)"
+        )
+
+
+def _supplied_masks(request: PreprocessRequest, frames: FrameSet, picture: Path) -> StepOutcome:
     """Masks of an earlier run, or that another tool put in their place: looked at, and kept as they are."""
+    processed = request.processed
     file = processed / MASKS_FILE
     if file.exists():
         mask_paths(processed, frames)
         return StepOutcome("masks", "supplied", "as they are", read_notes(file), None)
-    if not (processed / MASKS).is_dir():
-        raise InputError(
-            f"{processed / MASKS}: expected masks of hands and object, found none; give --masks DIR, "
-            "or --sam2 DIR with --clicks FILE"
-        )
+    check_mask_source(request)
     return _adopt_masks(processed, frames, picture)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from bigs.commands.run_folder import (
 from bigs.commands.run_lock import only_writer
 from bigs.commands.run_log import RunLog
 from bigs.commands.run_pictures import Told, write_pictures
+from bigs.commands.same_options import check_same_options
 from bigs.commands.truth import load_truth
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
@@ -39,6 +39,7 @@ from bigs.train.config_file import save_config
 from bigs.train.fit import FitReport, fit
 from bigs.train.initial import initial_trajectory
 from bigs.train.plan import check_plan
+from bigs.train.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Outcome:
     run: Path
     table: list[tuple[str, ...]]  # scores; the first row is the heading
     report: FitReport
-    seconds: float  # with those of interrupted runs that this one continues
+    seconds: float  # the sum of the report's, those of interrupted runs that this one continues included
 
 
 def reconstruct(
@@ -60,6 +61,7 @@ def reconstruct(
     ground_truth: Path | None = None,
     resume: bool = False,
     listen: Callable[[dict[str, Any]], None] = lambda event: None,
+    watch: Stopwatch | None = None,
 ) -> Outcome:
     """Reconstruct a clip into a run folder.
 
@@ -74,11 +76,13 @@ def reconstruct(
             optimisation.
         resume: continue an interrupted run.
         listen: told of stages, steps and notes, for progress displays.
+        watch: goes on from what the caller did before; a new one if not given.
 
     Raises:
         InputError: bad input, in one sentence.
     """
-    began = time.perf_counter()
+    watch = watch or Stopwatch("loading")
+    watch.begin("loading")
     check_plan(config)
     hand_models = load_hand_models(hand_model)
     clip = open_estimates(clip_path, hand_models)
@@ -88,6 +92,10 @@ def reconstruct(
     truth = None if ground_truth is None else load_truth(ground_truth, clip.frame_names, hand_models)
     if (out / CONFIG).exists() and not resume:
         raise InputError(f"{out}: expected a new run folder, found a run (pass --resume to continue it)")
+    origin = run_origin(clip_path, hand_model)
+    begun = (out / CHECKPOINTS / FILE_NAME).exists()
+    if begun and (out / CONFIG).exists():
+        check_same_options(out, config, origin)
     baseline = initial_trajectory(clip, hand_models)
     scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
 
@@ -95,8 +103,8 @@ def reconstruct(
     with only_writer(out):
         remove_parts(out)
         # A checkpoint of another configuration is refused; before there is one, the options count.
-        if not (out / CHECKPOINTS / FILE_NAME).exists():
-            save_config(out / CONFIG, config, run_origin(clip_path, hand_model))
+        if not begun:
+            save_config(out / CONFIG, config, origin)
         with RunLog(out / LOG, resume) as log:
 
             def log_and_listen(event: dict[str, Any]) -> None:
@@ -106,6 +114,7 @@ def reconstruct(
 
             for note in clip.notes:
                 log_and_listen({"event": "note", "stage": "clip", "text": f"note: {note}"})
+            listen({"event": "note", "stage": "start values", "text": "finding start values"})
             scene, report = fit(
                 clip,
                 hand_models,
@@ -115,12 +124,16 @@ def reconstruct(
                 checkpoints=out / CHECKPOINTS,
                 resume=resume,
                 listen=log_and_listen,
+                watch=watch,
             )
+            watch.begin("results")
             if clip.notes:
                 report.facts["estimates"] = "; ".join(clip.notes)
             playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)
+            watch.begin("scores")
+            listen({"event": "note", "stage": "outputs", "text": "scoring"})
             frames = frame_scores(clip, playback)
             scores["result"] = ({} if truth is None else evaluate(playback.trajectory(), truth)) | means(
                 frames
@@ -134,8 +147,15 @@ def reconstruct(
         table = comparison_table(scores, ALL_METRICS, told=told)
         if truth is not None:
             frames |= per_frame(playback.trajectory(), truth)
-        write_pictures(out, clip, playback, Told(table, frames, log.events, report))
-        return Outcome(out, table, report, report.before + time.perf_counter() - began)
+        watch.begin("pictures")
+        listen({"event": "note", "stage": "outputs", "text": "drawing pictures"})
+
+        def times() -> dict[str, float]:
+            report.seconds = watch.read()
+            return report.seconds
+
+        write_pictures(out, clip, playback, Told(table, frames, log.events, report, times))
+        return Outcome(out, table, report, sum(report.seconds.values()))
 
 
 def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, found_at
+from bigs.checks import InputError, found_at, meant
 from bigs.models.playback import Playback
 from bigs.models.playback_file import load_playback
 
@@ -30,6 +30,12 @@ def load_run(run: Path) -> Playback:
     """
     if not run.is_dir():
         raise InputError(f"{run}: expected a run folder, found {found_at(run)}")
+    if not (run / SCENE).exists() and not (run / CONFIG).exists():
+        inside = sorted(scene.parent for scene in run.glob(f"*/{SCENE}"))
+        if inside:
+            raise InputError(
+                f"{run}: expected a run folder, found one with runs in it{meant(str(inside[0]))}"
+            )
     return load_playback(run / SCENE)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ class Told:
     per_frame: Mapping[str, np.ndarray]  # score -> [T]
     log: Sequence[Mapping[str, Any]]
     report: FitReport
+    times: Callable[[], Mapping[str, float]]  # seconds by part, asked for when all else is drawn
 
 
 def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> None:
@@ -77,7 +78,7 @@ def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> Non
             for e in told.log
             if e["event"] == "step"
         ],
-        timings=told.report.seconds,
+        timings=told.times,
         skipped=told.report.skipped,
     )
 

@@ -97,7 +97,7 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     if metadata.get("digest") != digest:
         raise InputError(
             f"{path}: expected a checkpoint of this clip, hand model, configuration and version, "
-            f"found one of another run (digest {metadata.get('digest')} instead of {digest})"
+            "found one of another run (name another --out, or remove the folder)"
         )
     for side, hand in scene.hand_splats.items():
         if f"scene.hand_splats.{side}.shift" in tensors:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -38,6 +37,7 @@ from bigs.train.grasps import find_grasps
 from bigs.train.loop import StageProgress, StageState, run_stage
 from bigs.train.prior_stages import run_completion, run_guidance, without_missing_prior
 from bigs.train.scale_search import search_object_scale
+from bigs.train.stopwatch import Stopwatch
 from bigs.train.switches import without
 from bigs.types import Side
 
@@ -46,7 +46,7 @@ from bigs.types import Side
 class FitReport:
     """What happened, for logs and tables."""
 
-    seconds: dict[str, float] = field(default_factory=dict)  # per stage
+    seconds: dict[str, float] = field(default_factory=dict)  # per stage; they add up to the whole
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
     facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
@@ -68,6 +68,7 @@ def fit(
     checkpoints: Path | None = None,
     resume: bool = False,
     listen: Listener = lambda event: None,
+    watch: Stopwatch | None = None,
 ) -> tuple[Scene, FitReport]:
     """Fit a scene to a clip.
 
@@ -80,6 +81,7 @@ def fit(
         checkpoints: folder for checkpoints; None keeps none.
         resume: continue from the checkpoint there, if there is one.
         listen: told of stages, steps and notes as they happen.
+        watch: goes on through the stages; a new one if not given.
 
     Raises:
         InputError: the configuration names unknown groups or terms, or the checkpoint is of another run.
@@ -89,7 +91,8 @@ def fit(
     config, network_note = _without_missing_network(config, perceptual)
     config, prior_note = without_missing_prior(config, clip, denoiser)
     torch.manual_seed(config.seed)
-    began = time.perf_counter()
+    watch = watch or Stopwatch("start values")
+    watch.begin("start values")
     unknown = unknown_occluders(clip)
     start = build_scene(
         clip,
@@ -104,21 +107,23 @@ def fit(
     scene = start.scene
     gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
     report.skipped += [note for note in (network_note, prior_note) if note] + start.skipped
-    report.seconds["start values"] = time.perf_counter() - began
+    report.seconds = watch.read()
     digest = run_digest(clip, scene, config, perceptual, denoiser)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
     first = position.stage if position else 0
     if position:
         done = position.resume["step"] if position.resume else 0
         listen({"event": "resume", "index": first, "step": done})
-        report = _continued(FitReport(**position.report), report)
+        report = FitReport(**position.report)
+        report.before = sum(report.seconds.values())
+        watch.add(report.seconds)
     elif network_note:
         listen({"event": "note", "stage": "start values", "text": network_note})
     sources = EvidenceSource(clip, unknown, scene, config, perceptual)
 
     def keep(index: int, state: StageState | None) -> None:
         """Save what has been reached; of the stage that runs or has just ended."""
-        report.seconds[stage.name] = time.perf_counter() - began
+        report.seconds = watch.read()
         if checkpoints:
             save_checkpoint(checkpoints, scene, digest, index, state, asdict(report))
 
@@ -132,7 +137,7 @@ def fit(
             report.skipped.append(f"{stage.name}: {why}")
             continue
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
-        began = time.perf_counter() - report.seconds.get(stage.name, 0.0)
+        watch.begin(stage.name)
         continues = position.resume if position and index == first else None
         if isinstance(stage, ScaleSearchStage):
             size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
@@ -164,6 +169,7 @@ def fit(
                 now = len(scene.object_splats.base_points)
                 report.facts["object Gaussians"] = f"{gaussians} at the start, {now} after {stage.name}"
         keep(index + 1, None)
+    report.seconds = watch.read()
     scene.requires_grad_(False)
     if start.known and "object completed" not in report.facts:
         scene.replace_surface(start.known.of(scene.object_surface))
@@ -188,13 +194,6 @@ def _split(scene: Scene, stage: SplitStage) -> list[str]:
         count = len(scene.object_splats.shift)
         notes.append(f"{len(whole.means)} Gaussians of the object become {count}")
     return notes
-
-
-def _continued(saved: FitReport, started: FitReport) -> FitReport:
-    """The report of an interrupted run, to which the start values that were made once more are added."""
-    before = sum(saved.seconds.values())
-    seconds = {name: time + started.seconds.get(name, 0.0) for name, time in saved.seconds.items()}
-    return replace(saved, seconds=seconds, before=before)
 
 
 def _optimise(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from numbers import Real
 from pathlib import Path
@@ -69,7 +69,7 @@ def write_report(
     grasps: str = "",
     coverage: tuple[str, Image.Image] | None = None,
     log: Sequence[Mapping[str, Any]] = (),
-    timings: Mapping[str, float] | None = None,
+    timings: Mapping[str, float] | Callable[[], Mapping[str, float]] | None = None,
     skipped: Sequence[str] = (),
 ) -> None:
     """Write the report; `path` is whole or absent. Parts that are empty are left out.
@@ -89,7 +89,7 @@ def write_report(
         log: rows in the order they were logged: "stage" (text, optional), "step" (steps done in that stage),
             and numbers; dictionaries of numbers count as numbers of their own. Every number becomes a curve
             over all stages; what is neither is passed over.
-        timings: name -> seconds.
+        timings: name -> seconds, or a function that is asked for them when all else is done.
         skipped: what was not done, one sentence each with its reason.
 
     Raises:
@@ -124,7 +124,8 @@ def write_report(
     if curves:
         parts.append(f'<h2>Optimisation</h2><div class="curves">{"".join(curves)}</div>')
     if timings:
-        parts += ["<h2>Time</h2>", _table(_timing_rows(timings))]
+        seconds = timings() if callable(timings) else timings
+        parts += ["<h2>Time</h2>", _table(_timing_rows(seconds))]
     if skipped:
         parts.append(f"<h2>Skipped</h2><ul>{''.join(f'<li>{escape(line)}</li>' for line in skipped)}</ul>")
     body = "\n".join(parts)
