@@ -357,6 +357,9 @@ def show(outcome: Outcome) -> None:
     for line in outcome.report.retreats:
         say(f"recovered: {line}")
     print_table(outcome.table)
+    for line in outcome.meanings:
+        say(line)
+    say("all scores: report.html, metrics.json, bigs eval RUN --all")
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.report.seconds.items())
     say(f"{outcome.seconds:.1f} s in all: {times}")
     say(f"results in {outcome.run}: see preview.png and report.html")

@@ -19,11 +19,12 @@ def evaluate(
     hand_model: Path | None = None,
     perceptual_weights: tuple[Path, ...] = (),
     out: Path | None = None,
+    all: bool = False,
     threads: int = 0,
 ) -> None:
     """Score finished runs with the field's own definitions; several stand beside the paper's tables.
 
-    Each run gets its scores in metrics.json and a row per frame in frames.csv.
+    Each run gets its scores in metrics.json, scores.csv and report.html, and a row per frame in frames.csv.
 
     Args:
         runs: run folders.
@@ -34,6 +35,7 @@ def evaluate(
         hand_model: MANO-format files for a data set's poses; those of the run if not given.
         perceptual_weights: VGG-16 as torchvision publishes it, and LPIPS's channel weights, for LPIPS.
         out: folder for comparison.md and comparison.csv, with the paper's Tables 1, 2 and 4 beside.
+        all: show every score of a run, not only the first five; scores.csv in its folder has them, too.
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
@@ -53,7 +55,14 @@ def evaluate(
         for line in evaluation.remarks:
             say(f"{name}: {line}")
     if len(runs) == 1:
-        print_table(found[names[0]].table())
+        evaluation = found[names[0]]
+        print_table(evaluation.table() if all else evaluation.headlines())
+        for line in evaluation.meanings():
+            say(line)
+        say(
+            f"all scores: {runs[0] / 'scores.csv'}"
+            + ("" if all else ", or --all; they stand in report.html, too")
+        )
     elif out is None:
         for table in beside_paper({name: evaluation.scores["result"] for name, evaluation in found.items()}):
             say(f"\n{table.title}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from bigs.commands.clips import open_clip
 from bigs.commands.paper_tables import beside_paper, mean_scores
 from bigs.commands.pictures import frame_scores, means, novel_scores, partly
 from bigs.commands.run_clip import hand_models_of_run, origin_of
-from bigs.commands.run_folder import METRICS, load_run, write_json
+from bigs.commands.run_folder import METRICS, REPORT, load_run, write_json
 from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
 from bigs.data.base import Clip
 from bigs.data.novel import CAMERAS
@@ -25,13 +25,17 @@ from bigs.files import read_json
 from bigs.hand import HandModel, load_hand_models
 from bigs.losses.perceptual import VggWeights, perceptual_distance
 from bigs.losses.perceptual_file import load_perceptual_weights
+from bigs.metrics.headlines import headline_meanings, headline_table
 from bigs.metrics.picture import ALL_METRICS, Distance
 from bigs.metrics.report import comparison_table, evaluate, match_frames, per_frame
 from bigs.metrics.report import remarks as remarks_on
 from bigs.models.playback import Playback
+from bigs.train.initial import initial_trajectory
 from bigs.types import Side
+from bigs.viewer.report import replace_scores
 
 FRAMES = "frames.csv"
+SCORES = "scores.csv"
 COMPARISON = "comparison.md"
 COMPARISON_NUMBERS = "comparison.csv"
 
@@ -71,6 +75,14 @@ class Evaluation:
         """All scores as rows of text."""
         return comparison_table(self.scores, ALL_METRICS, details=True, told=self.told)
 
+    def headlines(self) -> list[tuple[str, ...]]:
+        """The few that are shown first."""
+        return headline_table(self.scores, self.told)
+
+    def meanings(self) -> list[str]:
+        """What those mean, a line each."""
+        return headline_meanings(self.scores, self.told)
+
 
 def evaluate_run(
     run: Path, plan: EvaluationPlan, listen: Callable[[str], None] = lambda text: None
@@ -100,6 +112,7 @@ def evaluate_run(
             f"{run}: expected something to score against (--gt, --clip or --novel), found neither "
             f"that nor the run's own clip {clip_path}"
         )
+    initial: dict[str, float] = {}
     result: dict[str, float] = {}
     frames: dict[str, np.ndarray] = {}
     told: dict[str, str] = {}
@@ -110,6 +123,9 @@ def evaluate_run(
         truth = load_truth(truth_path, playback.frame_names, hand_models)
         result |= evaluate(playback.trajectory(), truth)
         told |= remarks_on(playback.trajectory(), truth)
+        if clip is not None and clip.hands and not clip.annotated:
+            listen(f"{run.name}: initial estimates")
+            initial = evaluate(initial_trajectory(clip, hand_models_of_run(run)), truth)
         order = match_frames(truth.frame_names, playback.frame_names)
         frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
     if clip is None:
@@ -131,10 +147,15 @@ def evaluate_run(
     scores = read_json(path, "a run's scores") if path.exists() else {}
     # An earlier score that cannot be had any more does not stand beside the reason.
     earlier = {key: v for key, v in scores.get("result", {}).items() if key not in told}
-    scores["result"] = earlier | result
+    begun = initial or scores.get("initial")
+    scores = ({"initial": begun} if begun else {}) | {"result": earlier | result}
     write_json(path, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
-    return Evaluation(playback.name, scores, frames, tuple(remarks), told)
+    _write_scores(run / SCORES, scores)
+    evaluation = Evaluation(playback.name, scores, frames, tuple(remarks), told)
+    if (run / REPORT).is_file() and not replace_scores(run / REPORT, evaluation.table()):
+        remarks.append(f"{REPORT} is of an earlier version and keeps its scores")
+    return replace(evaluation, remarks=tuple(remarks))
 
 
 def run_names(runs: Sequence[Path]) -> list[str]:
@@ -219,6 +240,13 @@ def _own_novel(clip_path: Path | None) -> Path | None:
         return None
     folder = (clip_path.parent if clip_path.name == "build" else clip_path) / "novel"
     return folder if (folder / CAMERAS).is_file() else None
+
+
+def _write_scores(path: Path, scores: Mapping[str, Mapping[str, float]]) -> None:
+    """Every score with its name, unit and direction, a row each."""
+    keys = [key for key in ALL_METRICS if any(key in row for row in scores.values())]
+    rows = [[key, *ALL_METRICS[key][:3], *(row.get(key, "") for row in scores.values())] for key in keys]
+    _write_csv(path, ["key", "score", "unit", "better", *scores], rows)
 
 
 def _write_frames(path: Path, names: Sequence[str], columns: Mapping[str, np.ndarray]) -> None:

@@ -15,6 +15,7 @@ from bigs.commands.preprocess_steps import (
     hands_step,
     masks_step,
 )
+from bigs.preprocess.source import open_source
 
 RUN: dict[StepName, Callable[[PreprocessRequest, Callable[[str], None]], StepOutcome]] = {
     "frames": frames_step,
@@ -49,6 +50,8 @@ def preprocess(
     outcomes = []
     if len(steps) > 1:
         # What a later step lacks is said now, not after the minutes that earlier ones take.
+        if "frames" in steps and request.source is not None:
+            open_source(request.source)
         if "masks" in steps:
             check_mask_source(request)
         if "hands" in steps:

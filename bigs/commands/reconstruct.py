@@ -30,6 +30,7 @@ from bigs.commands.same_options import check_same_options
 from bigs.commands.truth import load_truth
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
+from bigs.metrics.headlines import headline_meanings, headline_table
 from bigs.metrics.picture import ALL_METRICS
 from bigs.metrics.report import comparison_table, evaluate, per_frame, remarks
 from bigs.models.playback import record
@@ -47,9 +48,10 @@ class Outcome:
     """What there is to tell after a run."""
 
     run: Path
-    table: list[tuple[str, ...]]  # scores; the first row is the heading
+    table: list[tuple[str, ...]]  # the first scores; the first row is the heading
     report: FitReport
     seconds: float  # the sum of the report's, those of interrupted runs that this one continues included
+    meanings: tuple[str, ...] = ()  # what the scores of the table mean
 
 
 def reconstruct(
@@ -155,7 +157,13 @@ def reconstruct(
             return report.seconds
 
         write_pictures(out, clip, playback, Told(table, frames, log.events, report, times))
-        return Outcome(out, table, report, sum(report.seconds.values()))
+        return Outcome(
+            out,
+            headline_table(scores, told),
+            report,
+            sum(report.seconds.values()),
+            tuple(headline_meanings(scores, told)),
+        )
 
 
 def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:

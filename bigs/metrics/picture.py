@@ -34,14 +34,14 @@ PICTURE_METRICS: dict[str, Metric] = {
 NOVEL, NOVEL_SCALED = "novel_", "novel_scaled_"
 PICTURE_METRICS |= {
     f"{prefix}{key}": Metric(f"{metric.paper}, {views}", metric.unit, metric.better, metric.detail)
-    for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, scaled clip"))
+    for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, one scale for the clip"))
     for key, metric in PICTURE_METRICS.items()
 }
 # Half a centimetre of depth moves print by a few pixels in a turned view and hides every other fault there.
 ALIGNED = "psnr_aligned"
 PICTURE_METRICS |= {
     f"{prefix}{ALIGNED}": Metric(f"PSNR of each subject where it fits best, {views}", "dB", "higher")
-    for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, scaled clip"))
+    for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, one scale for the clip"))
 }
 ALL_METRICS = METRICS | PICTURE_METRICS
 

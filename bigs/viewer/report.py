@@ -25,6 +25,9 @@ _FRAME_QUALITY = 75
 # Keys of a log row that say where it belongs and are no curves themselves.
 _POSITION_KEYS = ("stage", "step", "steps", "time")
 
+# Between them stand the scores, which may come later.
+_SCORES = ("<!-- scores -->", "<!-- end of scores -->")
+
 _STYLE = """
 :root { color-scheme: light dark; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -100,8 +103,7 @@ def write_report(
         parts.append(_table([("", ""), *facts.items()]))
     for caption, picture in (pictures or {}).items():
         parts.append(_figure(caption, picture))
-    if metrics:
-        parts += ["<h2>Scores</h2>", _table(metrics)]
+    parts.append(_scores(metrics))
     if frames:
         parts.append(_slider(frames))
     if video is not None:
@@ -136,6 +138,28 @@ def write_report(
     )
     with atomic_write(path) as file:
         file.write(document.encode())
+
+
+def replace_scores(path: Path, metrics: Sequence[Sequence[str]]) -> bool:
+    """Put another table of scores into a report; False where it has no place for one.
+
+    Args:
+        path: a file of `write_report`.
+        metrics: as there.
+    """
+    text = path.read_text(encoding="utf-8")
+    before, opening, rest = text.partition(_SCORES[0])
+    _, closing, after = rest.partition(_SCORES[1])
+    if not (opening and closing):
+        return False
+    with atomic_write(path) as file:
+        file.write(f"{before}{_scores(metrics)}{after}".encode())
+    return True
+
+
+def _scores(metrics: Sequence[Sequence[str]]) -> str:
+    body = f"<h2>Scores</h2>{_table(metrics)}" if metrics else ""
+    return f"{_SCORES[0]}{body}{_SCORES[1]}"
 
 
 def _figure(caption: str, picture: Image.Image) -> str:

@@ -1,0 +1,67 @@
+"""The few scores that say how good a run is, with what each means in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from bigs.metrics.picture import ALL_METRICS
+from bigs.metrics.report import comparison_table
+
+
+class Headline(NamedTuple):
+    """A score that is shown first."""
+
+    keys: tuple[str, ...]  # the first that a run has is shown
+    means: str
+
+
+HEADLINES = (
+    Headline(
+        ("mpjpe_ra_h", "mpjpe_ra_r", "mpjpe_ra_l"),
+        "how far the 21 joints of a hand are from the true ones, wrists laid on each other; lower is better",
+    ),
+    Headline(
+        ("cd_h_sq", "cd_r_sq", "cd_l_sq"),
+        "how far the object is from the true one, both seen from the wrist; lower is better",
+    ),
+    Headline(
+        ("cd_icp_sq",),
+        "how far the object's shape alone is from the true one, laid on it and scaled; lower is better",
+    ),
+    Headline(("f10_icp",), "how much of that shape is within 10 mm of the true one; higher is better"),
+    Headline(
+        ("psnr_foreground",),
+        "how like the video the rendering is where hands and object are; higher is better",
+    ),
+)
+
+
+def headline_keys(
+    scores: Mapping[str, Mapping[str, float]], told: Mapping[str, str] | None = None
+) -> list[str]:
+    """The keys of the scores that are shown first: of each headline the first that is there or told of."""
+    known = {key for row in scores.values() for key in row} | set(told or {})
+    found = (next((key for key in headline.keys if key in known), None) for headline in HEADLINES)
+    return [key for key in found if key is not None]
+
+
+def headline_table(
+    scores: Mapping[str, Mapping[str, float]], told: Mapping[str, str] | None = None
+) -> list[tuple[str, ...]]:
+    """As `comparison_table`, of the headlines alone."""
+    metrics = {key: ALL_METRICS[key] for key in headline_keys(scores, told)}
+    return comparison_table(scores, metrics, details=True, told=told)
+
+
+def headline_meanings(
+    scores: Mapping[str, Mapping[str, float]], told: Mapping[str, str] | None = None
+) -> list[str]:
+    """A line on what each of the headlines means and which direction is better."""
+    keys = headline_keys(scores, told)
+    return [
+        f"{ALL_METRICS[key].paper}: {headline.means}"
+        for headline in HEADLINES
+        for key in headline.keys
+        if key in keys
+    ]
