@@ -1,4 +1,5 @@
-//! One benchmark per stage and one for the whole, on four scenes: `cargo bench`, about two minutes.
+//! One benchmark per stage and some for the whole, on four scenes: `cargo bench`, about four minutes. Those of the whole
+//! also have a background, one Gaussian more with every call, and one and two threads.
 //!
 //! Throughput counts Gaussians where a stage goes through Gaussians, and composited (pixel, Gaussian) pairs where it
 //! goes through pixels. `cargo bench -- C/backward` runs a part. Set `RAYON_NUM_THREADS=1` to compare kernels rather
@@ -9,9 +10,10 @@ mod support;
 use std::hint::black_box;
 use std::time::Duration;
 
-use bigs_raster::{RasterSettings, RenderMode, Renderer, radix_sort, stages::Stages};
+use bigs_raster::{Gaussians, RasterSettings, RenderMode, Renderer, radix_sort, stages::Stages};
 use criterion::measurement::WallTime;
 use criterion::{BatchSize, BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
+use rayon::ThreadPoolBuilder;
 use support::Workload;
 
 /// Times one stage of one scene; `elements` is what its throughput counts.
@@ -55,6 +57,30 @@ fn benchmark(workload: &Workload, group: &mut BenchmarkGroup<'_, WallTime>) {
     time(group, "backward", pairs, || {
         frame.vjp(&gaussians, &v_colors, &v_alphas)
     });
+    let both = |gaussians: &Gaussians<'_, f32>, background: Option<&[f32]>| {
+        let frame = renderer.render(gaussians, &camera, background).expect("a frame");
+        frame.vjp(gaussians, &v_colors, &v_alphas)
+    };
+    time(group, "both", pairs, || both(&gaussians, None));
+    time(group, "both, background", pairs, || {
+        both(&gaussians, Some(&[0.2, 0.5, 0.7]))
+    });
+    // One Gaussian more with every call, as in a fit that adds some: no buffer is ever of the last call's size.
+    let mut count = n - n / 8;
+    time(group, "both, growing", pairs, || {
+        count = if count == n { n - n / 8 } else { count + 1 };
+        both(&workload.first(count), None)
+    });
+    let fewer = workload.first(n - n / 16);
+    time(group, "both, as many as growing", pairs, || both(&fewer, None));
+    for threads in [1, 2] {
+        let pool = ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("threads");
+        let name = format!("both, threads: {threads}");
+        time(group, &name, pairs, || pool.install(|| both(&gaussians, None)));
+    }
 }
 
 fn benchmarks(c: &mut Criterion) {

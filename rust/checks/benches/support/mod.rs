@@ -124,12 +124,17 @@ impl Workload {
     }
 
     pub(crate) fn gaussians(&self) -> Gaussians<'_, f32> {
+        self.first(self.means.len())
+    }
+
+    /// So many of them.
+    pub(crate) fn first(&self, count: usize) -> Gaussians<'_, f32> {
         Gaussians::new(
-            &self.means,
-            &self.quats,
-            &self.scales,
-            &self.opacities,
-            &self.colors,
+            &self.means[..count],
+            &self.quats[..count],
+            &self.scales[..count],
+            &self.opacities[..count],
+            &self.colors[..3 * count],
             3,
         )
         .expect("splats")

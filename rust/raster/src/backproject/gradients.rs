@@ -76,8 +76,9 @@ pub(crate) fn project_view_vjp<T: Real>(
     )
         .into_par_iter()
         .enumerate()
-        .map(
-            |(packet, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
+        .map_init(
+            PacketGradients::new,
+            |v, (packet, (means, quats, scales, opacities, colors, means2d, absgrad, cover))| {
                 let first = packet * PACKET_SIZE;
                 let from = PacketIntersections {
                     values: intersections,
@@ -93,10 +94,10 @@ pub(crate) fn project_view_vjp<T: Real>(
                     absgrad,
                     detach_means2d: out.detach_means2d,
                 };
-                let mut v = PacketGradients::new();
-                dispatch::gather(level, &from, screen, &mut v);
+                v.clear();
+                dispatch::gather(level, &from, screen, v);
                 if geometry && v.len > 0 {
-                    dispatch::vjp(level, gaussians, first, &projection, want_camera, &mut v);
+                    dispatch::vjp(level, gaussians, first, &projection, want_camera, v);
                     v.add_to(means, quats, scales, opacities);
                 }
                 v.viewmat

@@ -152,10 +152,12 @@ macro_rules! real {
                 <$T>::is_finite(self)
             }
             fn first_not_finite(values: &[Self]) -> Option<usize> {
-                // Counting vectorises, a search that may stop early does not.
-                let finite = values
-                    .par_chunks(1 << 14)
-                    .all(|part| part.iter().filter(|v| !v.is_finite()).count() == 0);
+                // A loop to the end vectorises, a search that may stop early does not; nor need it be widened to count.
+                let finite = values.par_chunks(1 << 14).all(|part| {
+                    part.iter()
+                        .fold(0, |any, v| any | <$Key>::from(!v.is_finite()))
+                        == 0
+                });
                 if finite {
                     return None;
                 }

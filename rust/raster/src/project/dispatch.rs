@@ -4,7 +4,7 @@
 
 use crate::input::gaussians::Gaussians;
 use crate::math::real::Real;
-use crate::project::packet::{PacketSplats, project_packet};
+use crate::project::packet::{PacketScratch, PacketSplats, project_packet};
 use crate::project::splat::Projection;
 use crate::project::tiles::TileGrid;
 use crate::simd::level::{Simd, SimdLevel, Work};
@@ -15,6 +15,7 @@ struct Project<'a, T, const ANTIALIASED: bool> {
     projection: &'a Projection<T>,
     grid: &'a TileGrid,
     wanted: Option<&'a [bool]>,
+    scratch: &'a mut PacketScratch<T>,
     out: PacketSplats<'a, T>,
 }
 
@@ -29,6 +30,7 @@ impl<T: Real, const ANTIALIASED: bool> Work for Project<'_, T, ANTIALIASED> {
             self.projection,
             self.grid,
             self.wanted,
+            self.scratch,
             self.out,
         );
     }
@@ -42,6 +44,7 @@ pub(crate) fn project<T: Real>(
     projection: &Projection<T>,
     grid: &TileGrid,
     wanted: Option<&[bool]>,
+    scratch: &mut PacketScratch<T>,
     out: PacketSplats<'_, T>,
 ) {
     if projection.antialiased() {
@@ -51,6 +54,7 @@ pub(crate) fn project<T: Real>(
             projection,
             grid,
             wanted,
+            scratch,
             out,
         });
     } else {
@@ -60,6 +64,7 @@ pub(crate) fn project<T: Real>(
             projection,
             grid,
             wanted,
+            scratch,
             out,
         });
     }

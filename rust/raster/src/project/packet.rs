@@ -59,6 +59,26 @@ fn whole_vectors(len: usize) -> usize {
     len.next_multiple_of(LANES).min(PACKET_SIZE)
 }
 
+/// What projecting a packet needs besides its inputs and results. One thread uses it for one packet after the other:
+/// whatever it holds, it is overwritten as far as it is read.
+pub(crate) struct PacketScratch<T> {
+    gaussians: Columns<T>,
+    splats: [Column<T>; 8],
+    outlines: [Column<T>; 6],
+    counts: [Column<u32>; 5],
+}
+
+impl<T: Real> PacketScratch<T> {
+    pub(crate) fn new() -> Self {
+        Self {
+            gaussians: Columns::new(),
+            splats: [[T::ZERO; PACKET_SIZE]; 8],
+            outlines: [[T::ZERO; PACKET_SIZE]; 6],
+            counts: [[0; PACKET_SIZE]; 5],
+        }
+    }
+}
+
 /// Where the splats of a packet go.
 pub(crate) struct PacketSplats<'a, T> {
     /// By Gaussian; of no meaning for one that no pixel sees.
@@ -75,19 +95,20 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     projection: &Projection<T>,
     grid: &TileGrid,
     wanted: Option<&[bool]>,
+    scratch: &mut PacketScratch<T>,
     out: PacketSplats<'_, T>,
 ) {
     let len = out.splats.len();
     let projection = *projection;
-    let mut columns = Columns::new();
+    let PacketScratch {
+        gaussians: columns,
+        splats: [xs, ys, depths, w11s, w22s, slopes, tilts, log_opacities],
+        outlines: [rxs, rys, padded, inverses, rights, half_heights],
+        counts: [tops, bottoms, seen, ceil_xs, ceil_ys],
+    } = scratch;
     for lane in 0..len.min(PACKET_SIZE) {
         columns.set(lane, gaussians, first + lane);
     }
-    let zero = [T::ZERO; PACKET_SIZE];
-    let [mut xs, mut ys, mut depths, mut log_opacities] = [zero; 4];
-    let [mut w11s, mut w22s, mut tilts, mut rxs, mut rys] = [zero; 5];
-    let [mut padded, mut inverses, mut slopes, mut rights, mut half_heights] = [zero; 5];
-    let [mut tops, mut bottoms, mut seen, mut ceil_xs, mut ceil_ys] = [[0u32; PACKET_SIZE]; 5];
     let (height, most) = (T::of(grid.height as f64), T::of(MOST_EXACT));
     // Tile sizes are powers of two; a division would cost more than all the rest.
     let shift = grid.tile_size.trailing_zeros();
@@ -178,6 +199,9 @@ pub(crate) struct PacketGradients<T> {
     moments: [Column<T>; 7],
     /// Of the Gaussians: mean, quaternion, scale, opacity; filled by [`packet_vjp`].
     gaussians: [Column<T>; 11],
+    /// What [`packet_vjp`] needs besides: the Gaussians, and their gradients of the camera.
+    inputs: Columns<T>,
+    viewmats: [Column<T>; 12],
     /// Of the camera, summed over the packet, if asked for.
     pub(crate) viewmat: [[T; 4]; 3],
 }
@@ -189,8 +213,16 @@ impl<T: Real> PacketGradients<T> {
             len: 0,
             moments: [[T::ZERO; PACKET_SIZE]; 7],
             gaussians: [[T::ZERO; PACKET_SIZE]; 11],
+            inputs: Columns::new(),
+            viewmats: [[T::ZERO; PACKET_SIZE]; 12],
             viewmat: [[T::ZERO; 4]; 3],
         }
+    }
+
+    /// Starts over. Columns keep what they hold: only the first `len` lanes of each mean anything.
+    pub(crate) fn clear(&mut self) {
+        self.len = 0;
+        self.viewmat = [[T::ZERO; 4]; 3];
     }
 
     /// Adds a Gaussian of the packet with the gradients of its splat, unless all are zero.
@@ -273,14 +305,20 @@ pub(crate) fn packet_vjp<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
 ) {
     let projection = *projection;
     let len = packet.len.min(PACKET_SIZE);
-    let mut columns = Columns::new();
+    let PacketGradients {
+        locals,
+        moments,
+        gaussians: out,
+        inputs,
+        viewmats,
+        viewmat,
+        ..
+    } = packet;
     for lane in 0..len {
-        columns.set(lane, gaussians, first + packet.locals[lane] as usize);
+        inputs.set(lane, gaussians, first + locals[lane] as usize);
     }
-    let mut viewmats = [[T::ZERO; PACKET_SIZE]; 12];
-    let (moments, out) = (&packet.moments, &mut packet.gaussians);
     for lane in 0..whole_vectors(len) {
-        let (mean, quat, scale, opacity) = columns.get(lane);
+        let (mean, quat, scale, opacity) = inputs.get(lane);
         let m = |k: usize| moments[k][lane];
         let [h, hu, hv, huu, huv, hvv, depth] = [m(0), m(1), m(2), m(3), m(4), m(5), m(6)];
         let v = SplatGradient {
@@ -307,7 +345,7 @@ pub(crate) fn packet_vjp<T: Real, const ANTIALIASED: bool, const CAMERA: bool>(
         }
     }
     if CAMERA {
-        for (sum, column) in packet.viewmat.as_flattened_mut().iter_mut().zip(&mut viewmats) {
+        for (sum, column) in viewmat.as_flattened_mut().iter_mut().zip(viewmats) {
             *sum = sum_of_lanes(column, len);
         }
     }

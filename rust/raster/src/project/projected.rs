@@ -10,7 +10,7 @@ use crate::input::settings::Limits;
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, bytes_of, stale};
 use crate::project::dispatch;
-use crate::project::packet::{PACKET_SIZE, PacketSplats};
+use crate::project::packet::{PACKET_SIZE, PacketScratch, PacketSplats};
 use crate::project::splat::{Projection, ScreenInfo, Splat};
 use crate::project::tiles::{Cover, TileGrid};
 
@@ -83,29 +83,33 @@ impl<T: Real> Projected<T> {
             )
                 .into_par_iter()
                 .enumerate()
-                .for_each(|(packet, (splats, cover, means2d, depths, radii))| {
-                    cover.counting = intersections.load(Ordering::Relaxed) > limit;
-                    let screen = ScreenInfo {
-                        means2d,
-                        depths,
-                        radii,
-                    };
-                    let out = PacketSplats {
-                        splats,
-                        screen,
-                        cover: &mut *cover,
-                    };
-                    dispatch::project(
-                        level,
-                        gaussians,
-                        packet * PACKET_SIZE,
-                        &projection,
-                        grid,
-                        wanted,
-                        out,
-                    );
-                    intersections.fetch_add(cover.count(), Ordering::Relaxed);
-                });
+                .for_each_init(
+                    PacketScratch::new,
+                    |scratch, (packet, (splats, cover, means2d, depths, radii))| {
+                        cover.counting = intersections.load(Ordering::Relaxed) > limit;
+                        let screen = ScreenInfo {
+                            means2d,
+                            depths,
+                            radii,
+                        };
+                        let out = PacketSplats {
+                            splats,
+                            screen,
+                            cover: &mut *cover,
+                        };
+                        dispatch::project(
+                            level,
+                            gaussians,
+                            packet * PACKET_SIZE,
+                            &projection,
+                            grid,
+                            wanted,
+                            scratch,
+                            out,
+                        );
+                        intersections.fetch_add(cover.count(), Ordering::Relaxed);
+                    },
+                );
             let intersections = intersections.into_inner();
             if intersections <= limit || u32::try_from(intersections).is_err() {
                 break;
