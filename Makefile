@@ -18,7 +18,7 @@ endif
 TORCH_VERSION := $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_STAMP := $(if $(filter cpu,$(TORCH)),.venv/torch-cpu)
 
-.PHONY: setup setup-all demo test lint test-rust test-python fuzz bench wheel clean
+.PHONY: setup setup-all demo test lint test-rust test-python fuzz bench wheel clean miri asan memcheck neon fuzz-engine
 
 setup: $(BIN)/bigs
 
@@ -82,3 +82,47 @@ wheel: setup
 
 clean:
 	rm -rf .venv target dist demo_run
+
+# Deeper checks of the engine. Each needs a tool that the rest does not, and says which where it is missing; their
+# outcomes are in docs/stability.md.
+RASTER := -p bigs-raster
+HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p')
+skip = { echo "make $@: skipped. It needs $(1)"; exit 0; }
+
+# Undefined behaviour: the buffer pool, shared slices, sort, lists, vectors of the baseline, and one small image.
+miri:
+	@cargo +nightly miri --version > /dev/null 2>&1 || \
+	$(call skip,Miri: rustup toolchain install nightly --component miri --component rust-src); \
+	export MIRIFLAGS=-Zmiri-disable-isolation RAYON_NUM_THREADS=2; \
+	cargo +nightly miri test $(RASTER) --lib -- memory:: lists:: simd:: math::real && \
+	cargo +nightly miri test $(RASTER) --test hostile -- colours_without_channels
+
+# Memory errors of all kernels that this machine has. The unstable flag works on stable with RUSTC_BOOTSTRAP.
+asan:
+	@test "$(HOST)" = x86_64-unknown-linux-gnu || $(call skip,a 64-bit x86 Linux); \
+	RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address cargo test $(RASTER) --target $(HOST) --target-dir target/asan \
+		--lib --test fuzz --test hostile --test oracle --test golden
+
+# The same for the baseline by valgrind, which knows no AVX-512, and finds uninitialised memory too.
+memcheck:
+	@command -v valgrind > /dev/null || $(call skip,valgrind); \
+	CARGO_TARGET_$(shell echo $(HOST) | tr a-z- A-Z_)_RUNNER="valgrind --quiet --error-exitcode=1" \
+	BIGS_RASTER_SIMD=baseline cargo test $(RASTER) --test golden --test hostile -- --skip thousands
+
+# The NEON kernels, built for ARM and run in an emulator.
+neon:
+	@rustup target list --installed 2> /dev/null | grep -q aarch64-unknown-linux-gnu || \
+	$(call skip,the target: rustup target add aarch64-unknown-linux-gnu); \
+	command -v aarch64-linux-gnu-gcc > /dev/null && command -v qemu-aarch64 > /dev/null || \
+	$(call skip,the Debian packages qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross); \
+	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu" \
+	cargo test $(RASTER) --target aarch64-unknown-linux-gnu --lib --test hostile --test golden --test oracle -- \
+		--skip every_cpu_level --skip peak
+
+# Hostile calls of the engine that coverage looks for, under the address sanitizer; FUZZ_SECONDS=600 for longer.
+FUZZ_SECONDS ?= 60
+fuzz-engine:
+	@cargo fuzz --version > /dev/null 2>&1 && cargo +nightly --version > /dev/null 2>&1 || \
+	$(call skip,cargo-fuzz and a nightly compiler: cargo install cargo-fuzz; rustup toolchain install nightly); \
+	cd rust && cargo +nightly fuzz run --fuzz-dir fuzz calls -- -max_total_time=$(FUZZ_SECONDS) -max_len=512 -timeout=30

@@ -53,6 +53,13 @@
 //! [`Camera::with_model`] makes a camera orthographic. [`Frame::median_ids`] names the Gaussian at each pixel's median
 //! depth. [`RasterSettings::antialiased`] keeps thin Gaussians from growing brighter.
 //!
+//! # glam
+//!
+//! Arrays are this crate's language; [`glam`]'s types are spoken at its border. [`Camera::from_affine3`],
+//! [`Camera::from_mat4`], [`Camera::look_at`] and [`Camera::orbit`] make cameras, [`Camera::affine3`], [`Camera::mat4`] and
+//! [`Camera::eye`] tell of them, and [`OwnedGaussians::from_glam`] copies Gaussians, quaternions of glam's order x y z w
+//! into w x y z. For `f64` the types are `DVec3`, `DQuat`, `DMat4` and `DAffine3` ([`GlamTypes`]).
+//!
 //! # Many views
 //!
 //! [`Batch`] renders entries × cameras at once. An input may be shared along either axis ([`Slabs`]): its gradient is
@@ -113,6 +120,8 @@ mod pipeline;
 mod project;
 mod simd;
 
+pub use glam;
+
 pub use api::batch::{Batch, BatchImages, BatchState, Counters};
 pub use api::batch_inputs::{BatchInputs, BatchShape, GaussianSlabs, Slabs};
 pub use api::batch_vjp::{BatchGradients, Wanted};
@@ -124,6 +133,7 @@ pub use color::harmonics::HarmonicsGradients;
 pub use error::RasterError;
 pub use input::camera::{Camera, CameraModel, Intrinsics};
 pub use input::gaussians::Gaussians;
+pub use input::glam::{GlamTypes, OwnedGaussians};
 pub use input::settings::{RasterSettings, RenderMode};
 #[doc(hidden)]
 pub use lists::radix_sort::radix_sort;

@@ -1,6 +1,7 @@
 //! Pinhole and orthographic cameras.
 
 use crate::error::RasterError;
+use crate::math::covariance::{cross, dot, three};
 use crate::math::real::Real;
 
 /// Pixels along a side at most: further out `f32` no longer resolves the hundredth of a pixel that culling allows for.
@@ -41,6 +42,21 @@ pub struct Intrinsics<T> {
     pub cx: T,
     /// Principal point, y.
     pub cy: T,
+}
+
+impl<T: Real> Intrinsics<T> {
+    /// Those of a camera with square pixels, its principal point in the middle, and this angle, in radians, from the upper
+    /// to the lower edge.
+    #[must_use]
+    pub fn from_fov_y(angle: T, width: usize, height: usize) -> Self {
+        let focal = T::of(0.5 * height as f64 / (0.5 * angle.as_f64()).tan());
+        Self {
+            fx: focal,
+            fy: focal,
+            cx: T::of(0.5 * width as f64),
+            cy: T::of(0.5 * height as f64),
+        }
+    }
 }
 
 /// A camera with OpenCV axes (x right, y down, z forward); the centre of pixel (column i, row j) is
@@ -116,6 +132,39 @@ impl<T: Real> Camera<T> {
     #[must_use]
     pub fn with_model(self, model: CameraModel) -> Self {
         Self { model, ..self }
+    }
+
+    /// The row-major world-to-camera matrix.
+    pub fn viewmat(&self) -> [[T; 4]; 4] {
+        let row = |i: usize| {
+            let [a, b, c] = self.rotation[i];
+            [a, b, c, self.translation[i]]
+        };
+        [row(0), row(1), row(2), [T::ZERO, T::ZERO, T::ZERO, T::ONE]]
+    }
+
+    /// Focal lengths and principal point.
+    pub fn intrinsics(&self) -> Intrinsics<T> {
+        self.k
+    }
+
+    /// How it projects.
+    pub fn model(&self) -> CameraModel {
+        self.model
+    }
+
+    /// The columns of the inverse of the 3×3 part of the world-to-camera matrix.
+    pub(crate) fn inverse_columns(&self) -> [[f64; 3]; 3] {
+        let [r0, r1, r2] = self.rotation.map(|row| row.map(T::as_f64));
+        let volume = dot(r0, cross(r1, r2));
+        [cross(r1, r2), cross(r2, r0), cross(r0, r1)].map(|column| column.map(|v| v / volume))
+    }
+
+    /// Where the camera is, in the world.
+    pub(crate) fn centre(&self) -> [T; 3] {
+        let [x, y, z] = self.inverse_columns();
+        let t = self.translation.map(T::as_f64);
+        three(|i| T::of(-(x[i] * t[0] + y[i] * t[1] + z[i] * t[2])))
     }
 
     /// Image width in pixels.

@@ -2,4 +2,5 @@
 
 pub(crate) mod camera;
 pub(crate) mod gaussians;
+pub(crate) mod glam;
 pub(crate) mod settings;

@@ -59,3 +59,20 @@ pub(crate) fn radix_sort_with<K: RadixKey>(pairs: &mut Vec<(K, u32)>, scratch: &
         std::mem::swap(pairs, &mut scratch.other);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pairs_are_sorted_and_equal_keys_keep_their_order() {
+        let keys = (0..200u64).map(|i| i.wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        for shift in [0, 20, 40, 60] {
+            let mut pairs: Vec<(u64, u32)> = keys.clone().map(|key| key >> shift).zip(0..).collect();
+            let mut expected = pairs.clone();
+            expected.sort_by_key(|&(key, _)| key);
+            radix_sort(&mut pairs);
+            assert_eq!(pairs, expected);
+        }
+    }
+}

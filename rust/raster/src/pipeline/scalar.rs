@@ -15,6 +15,7 @@ use crate::composite::scene::Scene;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
 use crate::input::gaussians::Gaussians;
+use crate::input::glam::GlamTypes;
 use crate::input::settings::Limits;
 use crate::lists::tile_lists::{ListScratch, TileLists, bin_splats};
 use crate::memory::pool::Pooled;
@@ -26,7 +27,7 @@ use crate::simd::Vectors;
 /// A scalar that the renderer is compiled for: `f32` or `f64`. Sealed, as [`Real`](crate::Real) is; its functions are
 /// not for callers.
 #[allow(private_interfaces, private_bounds, missing_docs)]
-pub trait Scalar: Vectors {
+pub trait Scalar: Vectors + GlamTypes {
     fn project(
         projected: &mut Projected<Self>,
         gaussians: &Gaussians<'_, Self>,

@@ -3,16 +3,35 @@
 use bigs_raster::Scalar;
 
 /// splitmix64: every seed is a good one.
-pub struct Dice(u64);
+pub struct Dice {
+    state: u64,
+    /// What is thrown first.
+    loaded: Vec<u8>,
+}
 
 impl Dice {
     pub fn new(seed: u64) -> Self {
-        Self(seed)
+        Self {
+            state: seed,
+            loaded: Vec::new(),
+        }
+    }
+
+    /// Dice that throw these bytes, one each, and then numbers of seed 0: for a fuzzer, which changes single throws.
+    pub fn of_bytes(bytes: &[u8]) -> Self {
+        Self {
+            state: 0,
+            loaded: bytes.iter().rev().copied().collect(),
+        }
     }
 
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
+        if let Some(byte) = self.loaded.pop() {
+            // In the low bits for `below`, in the high ones for `uniform`.
+            return u64::from(byte) * 0x0101_0101_0101_0101;
+        }
+        self.state = self.state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.state;
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
         z ^ (z >> 31)

@@ -1,0 +1,344 @@
+//! The types of glam at the border: cameras from its matrices, Gaussians from its vectors and quaternions.
+//!
+//! Nothing behind the border uses them: the loops of the renderer run over arrays of one number each.
+
+use crate::error::RasterError;
+use crate::input::camera::{Camera, Intrinsics};
+use crate::input::gaussians::Gaussians;
+use crate::math::covariance::{cross, dot, three};
+use crate::math::real::Real;
+
+/// The scalar's types in glam: `Vec3`, `Quat`, `Mat4` and `Affine3A` for `f32`, `DVec3`, `DQuat`, `DMat4` and `DAffine3`
+/// for `f64`.
+pub trait GlamTypes: Real {
+    /// A point or a direction.
+    type Vec3: Copy;
+    /// A rotation, stored x y z w.
+    type Quat: Copy;
+    /// A matrix of four columns.
+    type Mat4: Copy;
+    /// Three columns and a translation.
+    type Affine3: Copy;
+
+    /// x, y, z.
+    fn from_vec3(v: Self::Vec3) -> [Self; 3];
+    /// The vector of x, y, z.
+    fn to_vec3(v: [Self; 3]) -> Self::Vec3;
+    /// w, x, y, z: this crate's order.
+    fn from_quat(q: Self::Quat) -> [Self; 4];
+    /// The quaternion of w, x, y, z.
+    fn to_quat(q: [Self; 4]) -> Self::Quat;
+    /// Rows.
+    fn from_mat4(m: Self::Mat4) -> [[Self; 4]; 4];
+    /// The matrix with these rows.
+    fn to_mat4(rows: [[Self; 4]; 4]) -> Self::Mat4;
+    /// The matrix of a transform.
+    fn of_affine3(a: Self::Affine3) -> Self::Mat4;
+    /// The transform of a matrix whose last row is 0 0 0 1.
+    fn to_affine3(m: Self::Mat4) -> Self::Affine3;
+}
+
+macro_rules! glam_types {
+    ($T:ty, $Vec3:ty, $Quat:ty, $Mat4:ty, $Affine3:ty) => {
+        impl GlamTypes for $T {
+            type Vec3 = $Vec3;
+            type Quat = $Quat;
+            type Mat4 = $Mat4;
+            type Affine3 = $Affine3;
+
+            fn from_vec3(v: $Vec3) -> [Self; 3] {
+                v.to_array()
+            }
+            fn to_vec3(v: [Self; 3]) -> $Vec3 {
+                <$Vec3>::from_array(v)
+            }
+            fn from_quat(q: $Quat) -> [Self; 4] {
+                [q.w, q.x, q.y, q.z]
+            }
+            fn to_quat([w, x, y, z]: [Self; 4]) -> $Quat {
+                <$Quat>::from_xyzw(x, y, z, w)
+            }
+            fn from_mat4(m: $Mat4) -> [[Self; 4]; 4] {
+                m.transpose().to_cols_array_2d()
+            }
+            fn to_mat4(rows: [[Self; 4]; 4]) -> $Mat4 {
+                <$Mat4>::from_cols_array_2d(&rows).transpose()
+            }
+            fn of_affine3(a: $Affine3) -> $Mat4 {
+                a.into()
+            }
+            fn to_affine3(m: $Mat4) -> $Affine3 {
+                <$Affine3>::from_mat4(m)
+            }
+        }
+    };
+}
+glam_types!(f32, glam::Vec3, glam::Quat, glam::Mat4, glam::Affine3A);
+glam_types!(f64, glam::DVec3, glam::DQuat, glam::DMat4, glam::DAffine3);
+
+/// A vector of length 1; none for one without direction.
+fn normalized<T: Real>(v: [T; 3]) -> Option<[T; 3]> {
+    let largest = v[0].abs().greater(v[1].abs()).greater(v[2].abs());
+    if !(largest >= T::TINY && largest.is_finite()) {
+        return None;
+    }
+    let v = v.map(|x| x / largest);
+    let length = dot(v, v).sqrt();
+    Some(v.map(|x| x / length))
+}
+
+impl<T: GlamTypes> Camera<T> {
+    /// [`Camera::new`] from a world-to-camera transform: what glam's `look_to_rh` and its kin make looks along −z with y
+    /// up, which is turned by 180° about x against this crate's axes; [`Camera::look_at`] needs no turning.
+    ///
+    /// # Errors
+    /// As [`Camera::new`].
+    pub fn from_affine3(
+        world_to_camera: T::Affine3,
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
+        Self::from_mat4(T::of_affine3(world_to_camera), k, width, height)
+    }
+
+    /// [`Camera::new`] from a world-to-camera matrix.
+    ///
+    /// # Errors
+    /// As [`Camera::new`].
+    pub fn from_mat4(
+        world_to_camera: T::Mat4,
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
+        Self::new(T::from_mat4(world_to_camera), k, width, height)
+    }
+
+    /// A camera at `eye` that has `target` in its middle and `up` upwards.
+    ///
+    /// # Errors
+    /// A target at the eye, an `up` along the view, and as [`Camera::new`].
+    pub fn look_at(
+        eye: T::Vec3,
+        target: T::Vec3,
+        up: T::Vec3,
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
+        let (eye, target, up) = (T::from_vec3(eye), T::from_vec3(target), T::from_vec3(up));
+        let bad = |reason| RasterError::BadCamera { reason };
+        let forward = normalized(three(|i| target[i] - eye[i]))
+            .ok_or_else(|| bad("expected a target away from the eye, found one at it"))?;
+        let up = normalized(up).ok_or_else(|| bad("expected an upward direction, found none"))?;
+        let across = cross(forward, up);
+        if !(dot(across, across) > T::of(1e-10)) {
+            return Err(bad(
+                "expected an upward direction across the view, found one along it",
+            ));
+        }
+        let right = normalized(across).unwrap_or(across);
+        let down = cross(forward, right);
+        let row = |axis: [T; 3]| [axis[0], axis[1], axis[2], -dot(axis, eye)];
+        let last = [T::ZERO, T::ZERO, T::ZERO, T::ONE];
+        Self::new([row(right), row(down), row(forward), last], k, width, height)
+    }
+
+    /// A camera on a sphere around `target`, which it looks at: `azimuth` turns about `up`, `elevation` raises above the
+    /// plane across it, both in radians. Azimuth 0 is at the axis of the world that follows the one nearest to `up`, in
+    /// the order x, y, z, x.
+    ///
+    /// # Errors
+    /// An elevation of a quarter turn, at which nothing is up, and as [`Camera::look_at`].
+    pub fn orbit(
+        target: T::Vec3,
+        distance: T,
+        [azimuth, elevation]: [T; 2],
+        up: T::Vec3,
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
+        let axis = normalized(T::from_vec3(up)).ok_or(RasterError::BadCamera {
+            reason: "expected an upward direction, found none",
+        })?;
+        let nearest = (0..3).fold(
+            0,
+            |best, i| if axis[i].abs() > axis[best].abs() { i } else { best },
+        );
+        let mut next = [T::ZERO; 3];
+        next[(nearest + 1) % 3] = T::ONE;
+        let lean = dot(next, axis);
+        let start = normalized(three(|i| next[i] - lean * axis[i])).unwrap_or(next);
+        let side = cross(axis, start);
+        let (azimuth_sin, azimuth_cos) = azimuth.as_f64().sin_cos();
+        let (elevation_sin, elevation_cos) = elevation.as_f64().sin_cos();
+        let [a, b, c] = [
+            elevation_cos * azimuth_cos,
+            elevation_cos * azimuth_sin,
+            elevation_sin,
+        ]
+        .map(T::of);
+        let centre = T::from_vec3(target);
+        let eye = three(|i| centre[i] + distance * (a * start[i] + b * side[i] + c * axis[i]));
+        Self::look_at(T::to_vec3(eye), target, up, k, width, height)
+    }
+
+    /// The world-to-camera transform.
+    pub fn affine3(&self) -> T::Affine3 {
+        T::to_affine3(self.mat4())
+    }
+
+    /// The world-to-camera matrix.
+    pub fn mat4(&self) -> T::Mat4 {
+        T::to_mat4(self.viewmat())
+    }
+
+    /// Where the camera is, in the world.
+    pub fn eye(&self) -> T::Vec3 {
+        T::to_vec3(self.centre())
+    }
+}
+
+/// Gaussians that own their arrays, in this crate's layout: for callers whose own layout is another, such as glam's.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct OwnedGaussians<T> {
+    /// Centres in the world.
+    pub means: Vec<[T; 3]>,
+    /// Rotations, w x y z.
+    pub quats: Vec<[T; 4]>,
+    /// Standard deviations along the rotated axes.
+    pub scales: Vec<[T; 3]>,
+    /// Opacities.
+    pub opacities: Vec<T>,
+    /// `channels` values per Gaussian.
+    pub colors: Vec<T>,
+    /// Values per Gaussian in `colors`.
+    pub channels: usize,
+}
+
+impl<T: GlamTypes> OwnedGaussians<T> {
+    /// Copies glam's vectors and quaternions. glam stores a quaternion as x y z w, this crate as w x y z; the order is
+    /// converted.
+    #[must_use]
+    pub fn from_glam(
+        means: &[T::Vec3],
+        quats: &[T::Quat],
+        scales: &[T::Vec3],
+        opacities: &[T],
+        colors: &[T],
+        channels: usize,
+    ) -> Self {
+        Self {
+            means: means.iter().map(|&v| T::from_vec3(v)).collect(),
+            quats: quats.iter().map(|&q| T::from_quat(q)).collect(),
+            scales: scales.iter().map(|&v| T::from_vec3(v)).collect(),
+            opacities: opacities.to_vec(),
+            colors: colors.to_vec(),
+            channels,
+        }
+    }
+}
+
+impl<T: Real> OwnedGaussians<T> {
+    /// What a renderer takes.
+    ///
+    /// # Errors
+    /// As [`Gaussians::new`].
+    pub fn view(&self) -> Result<Gaussians<'_, T>, RasterError> {
+        Gaussians::new(
+            &self.means,
+            &self.quats,
+            &self.scales,
+            &self.opacities,
+            &self.colors,
+            self.channels,
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DAffine3, DMat4, DQuat, DVec3};
+
+    use super::*;
+
+    const K: Intrinsics<f64> = Intrinsics {
+        fx: 30.0,
+        fy: 30.0,
+        cx: 8.0,
+        cy: 8.0,
+    };
+
+    #[test]
+    fn matrices_go_in_and_out_unchanged() {
+        let turn = DAffine3::from_rotation_translation(
+            DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.7),
+            DVec3::new(1.0, -2.0, 3.0),
+        );
+        let camera = Camera::from_affine3(turn, K, 16, 16).unwrap();
+        assert_eq!(camera, Camera::from_mat4(DMat4::from(turn), K, 16, 16).unwrap());
+        assert_eq!((camera.affine3(), camera.mat4()), (turn, DMat4::from(turn)));
+        assert_eq!(camera.viewmat()[0][3], 1.0);
+        // The camera's own place is where the transform has its origin.
+        assert!(turn.transform_point3(camera.eye()).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_camera_sees_what_it_looks_at_in_the_middle_and_the_right_way_up() {
+        let (eye, target, up) = (DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, 0.2, 0.1), DVec3::Y);
+        let camera = Camera::look_at(eye, target, up, K, 16, 16).unwrap();
+        let seen = camera.affine3().transform_point3(target);
+        assert!(seen.truncate().length() < 1e-12 && seen.z > 0.0);
+        assert!((seen.z - eye.distance(target)).abs() < 1e-12 && camera.eye().distance(eye) < 1e-12);
+        // Image rows grow downwards.
+        assert!(camera.affine3().transform_point3(target + 0.1 * up).y < 0.0);
+        assert!((DMat4::determinant(&camera.mat4()) - 1.0).abs() < 1e-12);
+        for (eye, up) in [(target, up), (target + up, up), (eye, DVec3::ZERO)] {
+            let refused = Camera::look_at(eye, target, up, K, 16, 16);
+            assert!(matches!(refused, Err(RasterError::BadCamera { .. })));
+        }
+    }
+
+    #[test]
+    fn orbits_keep_their_distance_and_turn_about_up() {
+        let target = DVec3::new(1.0, 2.0, 3.0);
+        for up in [DVec3::Z, -DVec3::Y, DVec3::new(0.2, 0.9, 0.1)] {
+            let unit = up.normalize();
+            let around = |azimuth, elevation| {
+                let camera = Camera::orbit(target, 2.5, [azimuth, elevation], up, K, 16, 16).unwrap();
+                camera.eye() - target
+            };
+            let (start, quarter) = (around(0.0, 0.0), around(std::f64::consts::FRAC_PI_2, 0.0));
+            assert!(start.dot(unit).abs() < 1e-12 && start.dot(quarter).abs() < 1e-12);
+            assert!((start.cross(quarter).normalize() - unit).length() < 1e-12);
+            for (azimuth, elevation) in [(0.3, 0.4), (-2.0, -1.2)] {
+                let out = around(azimuth, elevation);
+                assert!((out.length() - 2.5).abs() < 1e-12);
+                assert!((out.dot(unit) - 2.5 * elevation.sin()).abs() < 1e-12);
+            }
+        }
+    }
+
+    #[test]
+    fn quaternions_of_glam_are_turned_into_this_crates_order() {
+        let quat = DQuat::from_axis_angle(DVec3::new(0.0, 0.6, 0.8), 1.1);
+        let owned = OwnedGaussians::from_glam(
+            &[DVec3::new(0.1, 0.2, 2.0)],
+            &[quat],
+            &[DVec3::ONE],
+            &[0.5],
+            &[1.0],
+            1,
+        );
+        assert_eq!(owned.quats, [[quat.w, quat.x, quat.y, quat.z]]);
+        assert_eq!(f64::to_quat(owned.quats[0]), quat);
+        assert!(owned.view().is_ok());
+        // The rotation is glam's.
+        let axes = crate::math::covariance::rotation_of(owned.quats[0]);
+        let turned = quat * DVec3::new(0.3, -0.4, 0.5);
+        let own = three(|i| dot(axes[i], [0.3, -0.4, 0.5]));
+        assert!((DVec3::from_array(own) - turned).length() < 1e-12);
+    }
+}
