@@ -194,6 +194,7 @@ impl<'a, T: Real> GaussianSlabs<'a, T> {
             opacities: self.opacities.slab(view, cameras),
             colors: self.colors.slab(view, cameras),
             channels: shape.channels,
+            harmonics: None,
         }
     }
 }

@@ -6,9 +6,10 @@ use crate::error::RasterError;
 use crate::input::camera::Camera;
 use crate::input::gaussians::{Gaussians, check_channels, check_finite, check_length};
 use crate::input::settings::{Limits, RasterSettings, RenderMode};
-use crate::memory::results::filled_with;
+use crate::memory::results::{filled_with, product};
 use crate::pipeline::scalar::Scalar;
 use crate::pipeline::view::{Image, View, ViewState, render_view};
+use crate::pipeline::view_colors::{view_colors, view_colors_vjp};
 use crate::project::splat::ScreenInfo;
 
 /// A rendered image, and what its gradients are computed from: camera, mode, settings, background and scratch memory.
@@ -26,6 +27,8 @@ pub struct Frame<T: Scalar> {
     /// Half the extent on screen in pixels, along x and y; zero for a Gaussian that no pixel sees.
     pub radii: Vec<[i32; 2]>,
     absgrad: bool,
+    /// The colours that the camera saw of harmonics.
+    seen: Option<Vec<T>>,
     state: ViewState<T>,
 }
 
@@ -51,12 +54,35 @@ impl<T: Scalar> Frame<T> {
         v_colors: &[T],
         v_alphas: &[T],
     ) -> Result<GaussianGrads<T>, RasterError> {
-        let mut grads = GaussianGrads::zeros(gaussians, self.absgrad)?;
         let v = Cotangents {
             colors: v_colors,
             alphas: v_alphas,
         };
-        self.state.vjp(gaussians, v, grads.slices())?;
+        let Some((harmonics, colors)) = gaussians.harmonics.zip(self.seen.as_deref()) else {
+            if gaussians.harmonics.is_some() || self.seen.is_some() {
+                return Err(RasterError::BadSize {
+                    name: "colors",
+                    expected: "harmonics if they were rendered, and else colours",
+                    got: gaussians.channels,
+                });
+            }
+            let mut grads = GaussianGrads::zeros(gaussians, self.absgrad)?;
+            self.state.vjp(gaussians, v, grads.slices())?;
+            return Ok(grads);
+        };
+        check_length("colors", gaussians.len() * 3, colors.len())?;
+        let painted = gaussians.with_colors(colors);
+        let mut grads = GaussianGrads::zeros(&painted, self.absgrad)?;
+        self.state.vjp(&painted, v, grads.slices())?;
+        grads.colors = view_colors_vjp(
+            gaussians.means,
+            &harmonics,
+            self.state.camera(),
+            colors,
+            &mut grads.colors,
+            &mut grads.means,
+            &mut grads.viewmat,
+        )?;
         Ok(grads)
     }
 }
@@ -73,7 +99,7 @@ pub struct GaussianGrads<T> {
     pub scales: Vec<[T; 3]>,
     /// Of the opacities.
     pub opacities: Vec<T>,
-    /// Of the colours.
+    /// Of the colours, or of the coefficients of harmonics.
     pub colors: Vec<T>,
     /// Of the first three rows of the world-to-camera matrix.
     pub viewmat: [[T; 4]; 3],
@@ -93,7 +119,7 @@ impl<T: Scalar> GaussianGrads<T> {
             quats: filled_with("quats", [T::ZERO; 4], &[n])?,
             scales: filled_with("scales", [T::ZERO; 3], &[n])?,
             opacities: filled_with("opacities", T::ZERO, &[n])?,
-            colors: filled_with("colors", T::ZERO, &[n, gaussians.channels])?,
+            colors: filled_with("colors", T::ZERO, &[gaussians.color_values()])?,
             viewmat: [[T::ZERO; 4]; 3],
             background: vec![T::ZERO; gaussians.channels],
             means2d: filled_with("means2d", [T::ZERO; 2], &[n])?,
@@ -160,27 +186,72 @@ impl<T: Scalar> Renderer<T> {
         camera: &Camera<T>,
         background: Option<&[T]>,
     ) -> Result<Frame<T>, RasterError> {
+        let pixels = camera.width * camera.height;
+        let total = self.mode.channels(gaussians.channels);
+        let mut colors = filled_with("image", T::ZERO, &[pixels, total])?;
+        let mut alphas = filled_with("image", T::ZERO, &[pixels])?;
+        let frame = self.render_over_zeros(gaussians, camera, background, &mut colors, &mut alphas)?;
+        Ok(Frame {
+            colors,
+            alphas,
+            ..frame
+        })
+    }
+
+    /// [`Renderer::render`] into buffers of the caller's, of pixels × channels and of pixels, whatever they held. The
+    /// frame's own `colors` and `alphas` stay empty.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`], and buffers of another length than the image.
+    pub fn render_into(
+        &self,
+        gaussians: &Gaussians<'_, T>,
+        camera: &Camera<T>,
+        background: Option<&[T]>,
+        colors: &mut [T],
+        alphas: &mut [T],
+    ) -> Result<Frame<T>, RasterError> {
+        let pixels = camera.width * camera.height;
+        let total = self.mode.channels(gaussians.channels);
+        check_length("colors", product(&[pixels, total]), colors.len())?;
+        check_length("alphas", pixels, alphas.len())?;
+        colors.fill(T::ZERO);
+        alphas.fill(T::ZERO);
+        self.render_over_zeros(gaussians, camera, background, colors, alphas)
+    }
+
+    fn render_over_zeros(
+        &self,
+        gaussians: &Gaussians<'_, T>,
+        camera: &Camera<T>,
+        background: Option<&[T]>,
+        colors: &mut [T],
+        alphas: &mut [T],
+    ) -> Result<Frame<T>, RasterError> {
         check_channels(self.mode, gaussians.channels)?;
         if let Some(values) = background {
             check_length("backgrounds", gaussians.channels, values.len())?;
             check_finite("backgrounds", values)?;
         }
+        let seen = gaussians
+            .harmonics
+            .map(|harmonics| view_colors(gaussians.means, &harmonics, camera))
+            .transpose()?;
         let view = View {
-            gaussians: *gaussians,
+            gaussians: seen
+                .as_ref()
+                .map_or(*gaussians, |colors| gaussians.with_colors(colors)),
             camera: *camera,
             background,
             pixel_mask: None,
         };
-        let (n, pixels) = (gaussians.len(), camera.width * camera.height);
-        let total = self.mode.channels(gaussians.channels);
-        let mut colors = filled_with("image", T::ZERO, &[pixels, total])?;
-        let mut alphas = filled_with("image", T::ZERO, &[pixels])?;
+        let n = gaussians.len();
         let mut means2d = filled_with("means2d", [T::ZERO; 2], &[n])?;
         let mut depths = filled_with("depths", T::ZERO, &[n])?;
         let mut radii = filled_with("radii", [0; 2], &[n])?;
         let image = Image {
-            colors: &mut colors,
-            alphas: &mut alphas,
+            colors,
+            alphas,
             screen: ScreenInfo {
                 means2d: &mut means2d,
                 depths: &mut depths,
@@ -189,12 +260,13 @@ impl<T: Scalar> Renderer<T> {
         };
         let state = render_view(&view, self.mode, &self.limits, image)?;
         Ok(Frame {
-            colors,
-            alphas,
+            colors: Vec::new(),
+            alphas: Vec::new(),
             means2d,
             depths,
             radii,
             absgrad: self.absgrad,
+            seen,
             state,
         })
     }

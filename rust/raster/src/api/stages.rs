@@ -49,6 +49,13 @@ impl<'a, T: Scalar> Stages<'a, T> {
         mode: RenderMode,
     ) -> Result<Self, RasterError> {
         check_channels(mode, gaussians.channels)?;
+        if let Some(harmonics) = gaussians.harmonics {
+            return Err(RasterError::BadSize {
+                name: "harmonics",
+                expected: "colours instead: stages have no camera to see harmonics from",
+                got: harmonics.bases,
+            });
+        }
         let limits = Limits::new(settings)?;
         let view = View {
             gaussians: *gaussians,

@@ -4,13 +4,8 @@ use rayon::prelude::*;
 
 use crate::color::basis::{basis, basis_vjp};
 use crate::error::RasterError;
-use crate::input::gaussians::check_length;
+use crate::input::gaussians::{check_degree, check_length};
 use crate::math::real::Real;
-
-/// The highest degree.
-const MAX_DEGREE: usize = 3;
-/// The most basis functions that coefficients may be given for.
-const MAX_BASES: usize = 1 << 16;
 
 /// Gaussians handled by one task. Fixed, so that sums do not depend on the number of threads.
 const PACKET_SIZE: usize = 512;
@@ -43,9 +38,7 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
         coefficients: &'a [T],
         mask: Option<&'a [bool]>,
     ) -> Result<Self, RasterError> {
-        if degree > MAX_DEGREE || (degree + 1) * (degree + 1) > bases || bases > MAX_BASES {
-            return Err(RasterError::BadDegree { degree, bases });
-        }
+        check_degree(degree, bases)?;
         let n = coefficients.len() / (3 * bases);
         check_length("coefficients", n * 3 * bases, coefficients.len())?;
         let places = dirs.len().checked_div(n).unwrap_or(0);

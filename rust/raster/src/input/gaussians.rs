@@ -8,6 +8,15 @@ use crate::memory::results::product;
 /// Most colour channels.
 const MAX_CHANNELS: usize = 1 << 16;
 
+/// Coefficients of spherical harmonics in place of colours.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Coefficients<'a, T> {
+    pub(crate) degree: usize,
+    pub(crate) bases: usize,
+    /// Gaussians × bases × red, green, blue.
+    pub(crate) values: &'a [T],
+}
+
 /// N Gaussians as flat arrays, borrowed from the caller.
 #[derive(Clone, Copy, Debug)]
 pub struct Gaussians<'a, T> {
@@ -17,6 +26,8 @@ pub struct Gaussians<'a, T> {
     pub(crate) opacities: &'a [T],
     pub(crate) colors: &'a [T],
     pub(crate) channels: usize,
+    /// If there are any, `colors` is empty until a camera is known.
+    pub(crate) harmonics: Option<Coefficients<'a, T>>,
 }
 
 impl<'a, T: Real> Gaussians<'a, T> {
@@ -57,7 +68,64 @@ impl<'a, T: Real> Gaussians<'a, T> {
             opacities,
             colors,
             channels,
+            harmonics: None,
         })
+    }
+
+    /// The same with colours that depend on the direction of view: real spherical harmonics, as the `.ply` files of 3D
+    /// Gaussian splatting hold them. A colour is the sum of the harmonics in the direction from the camera's centre to
+    /// the Gaussian's, plus ½, and at least 0.
+    ///
+    /// * `degree`: 0 to 3; higher bands of the coefficients are left out
+    /// * `bases`: basis functions each Gaussian has coefficients for, at least (degree + 1)²
+    /// * `coefficients`: Gaussians × `bases` × red, green, blue
+    ///
+    /// # Errors
+    /// As [`Gaussians::new`], and a degree that is too high for the engine or the coefficients.
+    pub fn with_harmonics(
+        means: &'a [[T; 3]],
+        quats: &'a [[T; 4]],
+        scales: &'a [[T; 3]],
+        opacities: &'a [T],
+        degree: usize,
+        bases: usize,
+        coefficients: &'a [T],
+    ) -> Result<Self, RasterError> {
+        check_degree(degree, bases)?;
+        check_length(
+            "coefficients",
+            product(&[means.len(), bases, 3]),
+            coefficients.len(),
+        )?;
+        check_finite("coefficients", coefficients)?;
+        let harmonics = Coefficients {
+            degree,
+            bases,
+            values: coefficients,
+        };
+        Ok(Self {
+            channels: 3,
+            harmonics: Some(harmonics),
+            ..Self::new(means, quats, scales, opacities, &[], 0)?
+        })
+    }
+
+    /// The same Gaussians with these colours of red, green and blue in place of harmonics.
+    pub(crate) fn with_colors<'b>(&self, colors: &'b [T]) -> Gaussians<'b, T>
+    where
+        'a: 'b,
+    {
+        Gaussians {
+            colors,
+            harmonics: None,
+            ..*self
+        }
+    }
+
+    /// Values of what colours are made of.
+    pub(crate) fn color_values(&self) -> usize {
+        self.harmonics
+            .map_or(self.len() * self.channels, |harmonics| harmonics.values.len())
     }
 
     /// How many Gaussians.
@@ -99,6 +167,19 @@ pub(crate) fn check_channels(mode: RenderMode, channels: usize) -> Result<(), Ra
             expected: "at least one channel in a mode with colours",
             got: 0,
         });
+    }
+    Ok(())
+}
+
+/// The highest degree of spherical harmonics.
+const MAX_DEGREE: usize = 3;
+/// The most basis functions that coefficients may be given for.
+const MAX_BASES: usize = 1 << 16;
+
+/// Whether there are harmonics of this degree, and coefficients for them.
+pub(crate) fn check_degree(degree: usize, bases: usize) -> Result<(), RasterError> {
+    if degree > MAX_DEGREE || (degree + 1) * (degree + 1) > bases || bases > MAX_BASES {
+        return Err(RasterError::BadDegree { degree, bases });
     }
     Ok(())
 }

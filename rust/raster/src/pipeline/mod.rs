@@ -2,3 +2,4 @@
 
 pub(crate) mod scalar;
 pub(crate) mod view;
+pub(crate) mod view_colors;

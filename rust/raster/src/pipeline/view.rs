@@ -48,6 +48,10 @@ pub(crate) struct ViewState<T: Scalar> {
 }
 
 impl<T: Scalar> ViewState<T> {
+    pub(crate) fn camera(&self) -> &Camera<T> {
+        &self.camera
+    }
+
     pub(crate) fn visible(&self) -> usize {
         self.projected.covers().iter().map(|cover| cover.visible).sum()
     }

@@ -11,7 +11,7 @@ use crate::simd::vector::Vector;
 /// constants twelve still fit the sixteen registers of the lower levels.
 const CHAINS: usize = 12;
 /// Multiply-adds of each chain in one timed run: a few hundred microseconds.
-const LENGTH: usize = if cfg!(miri) { 4 } else { 1 << 17 };
+const LENGTH: usize = if cfg!(miri) { 64 } else { 1 << 17 };
 /// Runs, of which the fastest counts: the clock of a core that was idle takes milliseconds to rise.
 const RUNS: usize = 40;
 

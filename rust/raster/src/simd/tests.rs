@@ -90,7 +90,7 @@ fn arithmetic_is_that_of_floats() {
 /// Powers by a polynomial of DEGREE are that precise, relatively.
 fn powers_to<V: Vector, const DEGREE: usize>(level: V::Level, precision: f64) {
     // Miri takes milliseconds for each.
-    for step in (0..40_000).step_by(if cfg!(miri) { 2000 } else { 1 }) {
+    for step in (0..40_000).step_by(if cfg!(miri) { 10_000 } else { 1 }) {
         // The values as the scalar has them, so that only the power's own error counts.
         let x = vector::<V>(level, |i| -(f64::from(step) + i as f64 / 16.0) * 0.003);
         for (x, power) in lanes(x).into_iter().zip(lanes(x.exp2::<DEGREE>())) {
@@ -131,7 +131,7 @@ fn exp2_is_as_right_as_its_degree() {
 }
 
 fn quotients<V: Vector>(level: V::Level) {
-    for step in (1..=10_000).step_by(if cfg!(miri) { 500 } else { 1 }) {
+    for step in (1..=10_000).step_by(if cfg!(miri) { 5000 } else { 1 }) {
         let divisor = vector::<V>(level, |i| (f64::from(step) - i as f64 / 32.0) * 1e-4);
         let dividend = V::splat(level, V::Scalar::of(1.0 / 3.0));
         for (d, q) in lanes(divisor).into_iter().zip(lanes(dividend.over(divisor))) {
