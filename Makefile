@@ -121,7 +121,6 @@ neon:
 		--skip every_cpu_level --skip peak
 
 # Hostile calls of the engine that coverage looks for, under the address sanitizer; FUZZ_SECONDS=600 for longer.
-FUZZ_SECONDS ?= 60
 fuzz-engine:
 	@cargo fuzz --version > /dev/null 2>&1 && cargo +nightly --version > /dev/null 2>&1 || \
 	$(call skip,cargo-fuzz and a nightly compiler: cargo install cargo-fuzz; rustup toolchain install nightly); \
