@@ -30,7 +30,7 @@ def test_a_closed_hand_is_a_fist() -> None:
     right = load_hand_models(None)["right"]
     pose = example("pose_hand").fist(right, torch.tensor([0.0, 1.0]))
     joints = right(torch.zeros(10), pose, torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3)).joints
-    # Tips of index, middle, ring and pinky lie in the palm: those of a claw are 37 to 50 mm from their knuckles.
+    # Tips of index, middle, ring and pinky lie in the palm; a claw has them 37 to 50 mm from their knuckles.
     tips, knuckles = joints[:, 17:], joints[:, [1, 4, 10, 7]]
     distance = (tips - knuckles).norm(dim=-1)
     assert (distance[0] > 0.05).all() and (distance[1] < 0.032).all()
