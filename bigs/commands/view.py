@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bigs.commands.run_clip import clip_of_run, hand_models_of_run
 from bigs.commands.run_folder import load_run
@@ -18,6 +19,7 @@ from bigs.geometry.rotations import axis_angle_to_matrix, quat_to_matrix
 from bigs.metrics.report import match_frames
 from bigs.models.playback import Playback
 from bigs.models.repose import FINGERS, bend_fingers, turn_object
+from bigs.raster import RasterSettings
 from bigs.types import Entity, Gaussians, HandObjectTrajectory
 from bigs.viewer.app import Viewer
 from bigs.viewer.stage import Mesh, Pose, Splats, Stage, Subject
@@ -108,20 +110,25 @@ def _subjects(moment: Playback) -> dict[str, Subject]:
     trajectory = moment.trajectory()
     return {
         _NAMES[entity]: Subject(
-            drawable(moment.gaussians([0], [entity])), mesh_of(trajectory, entity, frame=0)
+            drawable(moment.gaussians([0], [entity]), moment.K), mesh_of(trajectory, entity, frame=0)
         )
         for entity in moment.entities
     }
 
 
-def drawable(gaussians: Gaussians) -> Splats:
-    """Gaussians of one frame, [1, N, ...], with their covariances R diag(s²) R^T."""
+def drawable(gaussians: Gaussians, K: Tensor) -> Splats:
+    """Gaussians of one frame, [1, N, ...], as they are seen close by, with covariances R diag(s²) R^T + e² I.
+
+    The engine spreads every Gaussian by a part of a pixel, and they were fitted with that: alone they are too
+    small to close a surface, and from nearby its background would show through the cracks. So each keeps, as
+    its e, the spread that it had in the clip's picture.
+    """
     axes = quat_to_matrix(gaussians.quats[0]) * gaussians.scales[:, None, :]
     colors = gaussians.colors[0] if gaussians.colors.ndim == 3 else gaussians.colors
-    covariances = axes @ axes.transpose(-1, -2)
-    return Splats(
-        gaussians.means[0].numpy(), covariances.numpy(), colors.numpy(), gaussians.opacities.numpy()
-    )
+    means = gaussians.means[0]
+    spread = RasterSettings().eps2d * (means[:, 2] / K[0, 0]) ** 2
+    covariances = axes @ axes.transpose(-1, -2) + spread[:, None, None] * torch.eye(3)
+    return Splats(means.numpy(), covariances.numpy(), colors.numpy(), gaussians.opacities.numpy())
 
 
 def mesh_of(trajectory: HandObjectTrajectory, entity: Entity, frame: int) -> Mesh:

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_line import Answer, Run, assert_refused
 
 from bigs.checks import InputError
 from bigs.commands.run_clip import clip_of_run
 from bigs.commands.run_folder import load_run
-from bigs.commands.view import make_stage
+from bigs.commands.view import drawable, make_stage
 from bigs.data.ground_truth import load_ground_truth
 from bigs.models.playback import Playback
+from bigs.raster import rasterization
+from bigs.types import Gaussians
 
 pytestmark = pytest.mark.slow
 FRAME = 4
@@ -37,11 +40,37 @@ def test_at_rest_it_shows_the_run(playback: Playback) -> None:
         gaussians, splats = playback.gaussians([FRAME], [entity]), shown[name].splats
         np.testing.assert_allclose(splats.means, gaussians.means[0], atol=1e-7)
         np.testing.assert_allclose(splats.colors, gaussians.colors[0], atol=1e-6)
-        # A covariance has the squares of the scales as its eigenvalues, whatever way it is turned.
+        # A covariance has the squares of the scales as its eigenvalues, whatever way it is turned, and beside
+        # them what a Gaussian was spread in the clip's picture.
         spread = np.sort(np.linalg.eigvalsh(splats.covariances.astype(float)), axis=1)
-        np.testing.assert_allclose(spread, np.sort(gaussians.scales.numpy() ** 2, axis=1), rtol=1e-3)
+        pixel = gaussians.means[0, :, 2:].numpy() / playback.K[0, 0].item()
+        expected = np.sort(gaussians.scales.numpy() ** 2, axis=1) + 0.3 * pixel**2
+        np.testing.assert_allclose(spread, expected, rtol=1e-3)
         true = trajectory.object_verts if entity == "object" else trajectory.verts[entity]
         np.testing.assert_allclose(shown[name].mesh.verts, true[FRAME], atol=1e-7)
+
+
+def test_a_surface_that_is_closed_in_the_clip_is_closed_from_nearby() -> None:
+    """Little Gaussians 2 mm apart, 60 cm away where a pixel is 2.4 mm wide, seen eight times as large."""
+    places = 0.002 * torch.arange(-20.0, 21.0)
+    x, y = torch.meshgrid(places, places, indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, 0.6)], dim=-1).reshape(1, -1, 3)
+    count = means.shape[1]
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(1, count, 4)
+    wall = Gaussians(
+        means, quats, torch.full((count, 3), 6e-4), torch.full((count,), 0.9), means[0] * 0 + 0.5
+    )
+    K = torch.tensor([[250.0, 0.0, 8.0], [0.0, 250.0, 8.0], [0.0, 0.0, 1.0]])
+    near = torch.tensor([[2000.0, 0.0, 32.0], [0.0, 2000.0, 32.0], [0.0, 0.0, 1.0]])
+
+    def least_alpha(scales: torch.Tensor, camera: torch.Tensor, size: int) -> float:
+        seen = wall._replace(quats=quats[0], means=means[0], scales=scales)
+        return float(rasterization(*seen, torch.eye(4)[None], camera[None], size, size).alphas.min())
+
+    shown = torch.as_tensor(drawable(wall, K).covariances)
+    assert least_alpha(wall.scales, K, 16) > 0.8
+    assert least_alpha(wall.scales, near, 64) < 0.7
+    assert least_alpha(shown.diagonal(dim1=1, dim2=2).sqrt(), near, 64) > 0.8
 
 
 @pytest.mark.parametrize(
