@@ -7,6 +7,10 @@
 mod photo;
 #[path = "support/picture.rs"]
 mod picture;
+#[path = "support/ply.rs"]
+mod ply;
+#[path = "support/splats.rs"]
+mod splats;
 
 use std::error::Error;
 use std::ffi::OsString;
@@ -19,6 +23,7 @@ use fastrand::Rng;
 use lexopt::prelude::*;
 
 use picture::Picture;
+use splats::Splats;
 
 const HELP: &str = "\
 Fits Gaussians to a picture.
@@ -27,6 +32,8 @@ Usage: fit_image [picture.png] [options]
 
   picture.png      what to fit; without it a built-in picture
   --out PATH       the result, fit.png by default
+  --save-ply PATH  also write the Gaussians, for `render` and other viewers
+  --start PLY      begin with the Gaussians of a file, as --save-ply wrote it, instead of random ones
   --gaussians N    3000 by default
   --steps N        500 by default
   --seed N         of the initial places, 0 by default; the same seed gives the same bits
@@ -37,6 +44,8 @@ Usage: fit_image [picture.png] [options]
 struct Options {
     picture: Option<PathBuf>,
     out: PathBuf,
+    save_ply: Option<PathBuf>,
+    start: Option<PathBuf>,
     gaussians: usize,
     steps: usize,
     seed: u64,
@@ -49,6 +58,8 @@ impl Options {
         let mut options = Self {
             picture: None,
             out: "fit.png".into(),
+            save_ply: None,
+            start: None,
             gaussians: 3000,
             steps: 500,
             seed: 0,
@@ -57,6 +68,8 @@ impl Options {
         while let Some(argument) = parser.next()? {
             match argument {
                 Long("out") | Short('o') => options.out = parser.value()?.into(),
+                Long("save-ply") => options.save_ply = Some(parser.value()?.into()),
+                Long("start") => options.start = Some(parser.value()?.into()),
                 Long("gaussians") => options.gaussians = parser.value()?.parse()?,
                 Long("steps") => options.steps = parser.value()?.parse()?,
                 Long("seed") => options.seed = parser.value()?.parse()?,
@@ -170,17 +183,46 @@ impl Parameters {
         }
         parameters
     }
+
+    fn of(splats: &Splats) -> Self {
+        Self {
+            means: splats.means.clone(),
+            quats: splats.quats.clone(),
+            log_scales: splats.scales.iter().map(|s| s.map(f32::ln)).collect(),
+            logit_opacities: splats.opacities.iter().map(|o| (o / (1.0 - o)).ln()).collect(),
+            colors: (0..splats.len()).flat_map(|i| splats.color(i)).collect(),
+        }
+    }
+
+    fn splats(&self) -> Splats {
+        let mut splats = Splats::default();
+        for (i, &mean) in self.means.iter().enumerate() {
+            let color = [0, 1, 2].map(|c| self.colors[3 * i + c]);
+            let opacity = 1.0 / (1.0 + (-self.logit_opacities[i]).exp());
+            splats.push(
+                mean,
+                self.quats[i],
+                self.log_scales[i].map(f32::exp),
+                opacity,
+                color,
+            );
+        }
+        splats
+    }
 }
 
 fn psnr(mean_square: f64) -> f64 {
     -10.0 * mean_square.log10()
 }
 
-/// The fitted picture and its PSNR.
-fn fit(target: &Picture, options: &Options) -> Result<(Picture, f64), Box<dyn Error>> {
+/// The fitted picture and its Gaussians.
+fn fit(target: &Picture, options: &Options) -> Result<(Picture, Splats), Box<dyn Error>> {
     let (width, height) = (target.width, target.height);
-    let mut p = Parameters::random(target, options.gaussians, &mut Rng::with_seed(options.seed));
-    let n = options.gaussians;
+    let mut p = match &options.start {
+        Some(path) => Parameters::of(&ply::read(path)?),
+        None => Parameters::random(target, options.gaussians, &mut Rng::with_seed(options.seed)),
+    };
+    let n = p.means.len();
     let focal = width as f32;
     let k = Intrinsics {
         fx: focal,
@@ -227,7 +269,7 @@ fn fit(target: &Picture, options: &Options) -> Result<(Picture, f64), Box<dyn Er
         }
         if step == options.steps {
             let rgb = frame.colors;
-            return Ok((Picture { width, height, rgb }, quality));
+            return Ok((Picture { width, height, rgb }, p.splats()));
         }
 
         let mut v = frame.vjp(&gaussians, &v_colors, &v_alphas)?;
@@ -269,12 +311,12 @@ where
     };
     let (longer, shorter) = (target.width.max(target.height), target.width.min(target.height));
     let target = photo::shrunk(&target, longer.div_ceil(options.side).min(shorter));
-    println!(
-        "{}x{} pixels, {} Gaussians",
-        target.width, target.height, options.gaussians
-    );
-    let (fitted, _) = fit(&target, &options)?;
+    println!("{}x{} pixels", target.width, target.height);
+    let (fitted, splats) = fit(&target, &options)?;
     picture::write(&options.out, &fitted)?;
+    if let Some(path) = &options.save_ply {
+        ply::write(path, &splats)?;
+    }
     println!("{}", options.out.display());
     Ok(())
 }

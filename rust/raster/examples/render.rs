@@ -209,8 +209,7 @@ where
             azimuth: orbit.azimuth + 360.0 * frame as f32 / options.frames as f32,
             ..orbit
         };
-        let colors = splats.colors(orbit.eye()).map_err(|e| e.to_string())?;
-        let gaussians = splats.view(&colors).map_err(|e| e.to_string())?;
+        let gaussians = splats.view().map_err(|e| e.to_string())?;
         let camera = orbit
             .camera(options.model, options.fov, width, height)
             .map_err(|e| e.to_string())?;

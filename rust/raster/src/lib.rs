@@ -49,7 +49,6 @@
 //!
 //! # Beyond plain colours and pinholes
 //!
-//! [`Harmonics`] turns spherical harmonics into the colours that a camera sees, and back for gradients.
 //! [`Camera::with_model`] makes a camera orthographic. [`Frame::median_ids`] names the Gaussian at each pixel's median
 //! depth. [`RasterSettings::antialiased`] keeps thin Gaussians from growing brighter.
 //!
@@ -74,7 +73,8 @@
 //!
 //! # Colours that depend on the direction of view
 //!
-//! [`Harmonics`] turns coefficients of spherical harmonics into the colours of one or more views, and gradients back.
+//! [`Gaussians::with_harmonics`] takes coefficients of spherical harmonics in place of colours. [`Harmonics`] alone turns
+//! coefficients into the colours of one or more views, and gradients back.
 //!
 //! # Memory
 //!

@@ -322,3 +322,23 @@ fn pictures_are_fitted_too() {
     let shown = Shown::of(&out);
     assert_eq!((shown.width, shown.height), (25, 15));
 }
+
+#[test]
+fn a_fit_goes_on_from_its_file() {
+    let (ply, first, again) = (
+        temporary("fitted.ply"),
+        temporary("fitted.png"),
+        temporary("fitted_again.png"),
+    );
+    let fit = |arguments: &[&str]| {
+        let common = ["--side", "24", "--gaussians", "40"];
+        let arguments = [&common[..], arguments].concat();
+        fit_image::run(arguments.iter().map(ToString::to_string).collect::<Vec<_>>()).unwrap();
+    };
+    fit(&["--steps", "20", "--out", &first, "--save-ply", &ply]);
+    fit(&["--steps", "0", "--out", &again, "--start", &ply]);
+    let (first, again) = (Shown::of(&first), Shown::of(&again));
+    let same = first.rgb.iter().zip(&again.rgb).all(|(a, b)| a.abs_diff(*b) <= 1);
+    assert!(same, "the file holds what was fitted");
+    run_render(&[&ply, "--size", "20x20", "--out", &temporary("fitted_seen.png")]).unwrap();
+}

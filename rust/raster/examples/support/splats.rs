@@ -1,6 +1,8 @@
 //! Gaussians that own their arrays, and where a camera should stand to see them.
+// Each example uses a part.
+#![allow(dead_code)]
 
-use bigs_raster::{Gaussians, Harmonics, RasterError};
+use bigs_raster::{Gaussians, RasterError};
 
 /// The constant real spherical harmonic.
 const SH_C0: f32 = 0.282_094_79;
@@ -41,26 +43,23 @@ impl Splats {
         self.harmonics.push(rgb.map(|v| (v - 0.5) / SH_C0));
     }
 
-    /// Red, green and blue per Gaussian, as seen from a place.
-    pub(crate) fn colors(&self, eye: [f32; 3]) -> Result<Vec<f32>, RasterError> {
-        let directions: Vec<[f32; 3]> = self
-            .means
-            .iter()
-            .map(|mean| [0, 1, 2].map(|axis| mean[axis] - eye[axis]))
-            .collect();
+    /// What the renderer takes.
+    pub(crate) fn view(&self) -> Result<Gaussians<'_, f32>, RasterError> {
         let bases = (self.degree + 1).pow(2);
-        let coefficients = self.harmonics.as_flattened();
-        let values = Harmonics::new(self.degree, bases, &directions, coefficients, None)?.evaluate();
-        Ok(values
-            .into_flattened()
-            .into_iter()
-            .map(|v| (v + 0.5).max(0.0))
-            .collect())
+        Gaussians::with_harmonics(
+            &self.means,
+            &self.quats,
+            &self.scales,
+            &self.opacities,
+            self.degree,
+            bases,
+            self.harmonics.as_flattened(),
+        )
     }
 
-    /// What the renderer takes.
-    pub(crate) fn view<'a>(&'a self, colors: &'a [f32]) -> Result<Gaussians<'a, f32>, RasterError> {
-        Gaussians::new(&self.means, &self.quats, &self.scales, &self.opacities, colors, 3)
+    /// Red, green and blue of a Gaussian without the part that depends on the direction of view.
+    pub(crate) fn color(&self, i: usize) -> [f32; 3] {
+        self.harmonics[i * (self.degree + 1).pow(2)].map(|v| v * SH_C0 + 0.5)
     }
 
     /// A centre and a radius that most Gaussians lie within. Medians, because captured scenes have far-off strays.

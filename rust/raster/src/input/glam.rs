@@ -139,6 +139,18 @@ impl<T: GlamTypes> Camera<T> {
             ));
         }
         let right = normalized(across).unwrap_or(across);
+        Self::with_axes(eye, right, forward, k, width, height)
+    }
+
+    /// A camera at `eye` with these unit vectors to its right and forward.
+    fn with_axes(
+        eye: [T; 3],
+        right: [T; 3],
+        forward: [T; 3],
+        k: Intrinsics<T>,
+        width: usize,
+        height: usize,
+    ) -> Result<Self, RasterError> {
         let down = cross(forward, right);
         let row = |axis: [T; 3]| [axis[0], axis[1], axis[2], -dot(axis, eye)];
         let last = [T::ZERO, T::ZERO, T::ZERO, T::ONE];
@@ -147,10 +159,10 @@ impl<T: GlamTypes> Camera<T> {
 
     /// A camera on a sphere around `target`, which it looks at: `azimuth` turns about `up`, `elevation` raises above the
     /// plane across it, both in radians. Azimuth 0 is at the axis of the world that follows the one nearest to `up`, in
-    /// the order x, y, z, x.
+    /// the order x, y, z, x. At an elevation of a quarter turn the azimuth still says which way is up in the image.
     ///
     /// # Errors
-    /// An elevation of a quarter turn, at which nothing is up, and as [`Camera::look_at`].
+    /// An `up` of length 0, and as [`Camera::new`].
     pub fn orbit(
         target: T::Vec3,
         distance: T,
@@ -180,9 +192,12 @@ impl<T: GlamTypes> Camera<T> {
             elevation_sin,
         ]
         .map(T::of);
-        let centre = T::from_vec3(target);
-        let eye = three(|i| centre[i] + distance * (a * start[i] + b * side[i] + c * axis[i]));
-        Self::look_at(T::to_vec3(eye), target, up, k, width, height)
+        let (centre, up) = (T::from_vec3(target), axis);
+        let out = three(|i| a * start[i] + b * side[i] + c * up[i]);
+        let eye = three(|i| centre[i] + distance * out[i]);
+        let (sin, cos) = (T::of(azimuth_sin), T::of(azimuth_cos));
+        let right = three(|i| cos * side[i] + -sin * start[i]);
+        Self::with_axes(eye, right, out.map(|v| -v), k, width, height)
     }
 
     /// The world-to-camera transform.
@@ -310,6 +325,7 @@ mod tests {
                 let camera = Camera::orbit(target, 2.5, [azimuth, elevation], up, K, 16, 16).unwrap();
                 camera.eye() - target
             };
+            assert!((around(0.7, std::f64::consts::FRAC_PI_2) - 2.5 * unit).length() < 1e-12);
             let (start, quarter) = (around(0.0, 0.0), around(std::f64::consts::FRAC_PI_2, 0.0));
             assert!(start.dot(unit).abs() < 1e-12 && start.dot(quarter).abs() < 1e-12);
             assert!((start.cross(quarter).normalize() - unit).length() < 1e-12);
