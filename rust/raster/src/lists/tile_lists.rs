@@ -1,5 +1,7 @@
 //! Which splats a tile shows, front to back.
 
+use rayon::prelude::*;
+
 use crate::error::RasterError;
 use crate::lists::radix_sort::{SortScratch, radix_sort_with};
 use crate::math::real::Real;
@@ -35,6 +37,8 @@ pub(crate) struct ListScratch<T: Real> {
     /// Per tile, where in its list the next splat from the front goes, and one past where the next from the back goes.
     fronts: Vec<u32>,
     backs: Vec<u32>,
+    /// By segment of the order and by tile, where in its list the segment's next splat goes.
+    segments: Vec<u32>,
 }
 
 impl<T: Real> Default for ListScratch<T> {
@@ -44,13 +48,18 @@ impl<T: Real> Default for ListScratch<T> {
             sort: SortScratch::default(),
             fronts: Vec::new(),
             backs: Vec::new(),
+            segments: Vec::new(),
         }
     }
 }
 
 impl<T: Real> Buffers for ListScratch<T> {
     fn bytes(&self) -> usize {
-        bytes_of(&self.order) + self.sort.bytes() + bytes_of(&self.fronts) + bytes_of(&self.backs)
+        bytes_of(&self.order)
+            + self.sort.bytes()
+            + bytes_of(&self.fronts)
+            + bytes_of(&self.backs)
+            + bytes_of(&self.segments)
     }
 }
 
@@ -121,16 +130,23 @@ struct Lists<'a> {
 }
 
 impl Lists<'_> {
+    /// The packet of a Gaussian, and its number there.
+    #[inline(always)]
+    fn cover_of(&self, i: u32) -> (&Cover, usize) {
+        (&self.covers[i as usize / PACKET_SIZE], i as usize % PACKET_SIZE)
+    }
+
     /// Starts to bring the tiles of a Gaussian into the first cache.
     #[inline(always)]
     fn prefetch(&self, i: u32) {
-        self.covers[i as usize / PACKET_SIZE].prefetch(i as usize % PACKET_SIZE);
+        let (cover, local) = self.cover_of(i);
+        cover.prefetch(local);
     }
 
     /// Puts a Gaussian into the list of each tile that it reaches, where `place` says.
     #[inline(always)]
     fn put(&self, i: u32, mut place: impl FnMut(u32) -> u32) {
-        let (cover, local) = (&self.covers[i as usize / PACKET_SIZE], i as usize % PACKET_SIZE);
+        let (cover, local) = self.cover_of(i);
         for (own, &tile) in cover.intersections_of(local).zip(cover.tiles_of(local)) {
             let at = place(tile);
             self.gaussians.set(at as usize, i);
@@ -142,46 +158,94 @@ impl Lists<'_> {
 /// Gaussians whose tiles are asked for ahead of the one being listed: in order of depth they lie anywhere.
 const AHEAD: usize = 8;
 
-/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_by_tile`]: the near half from the front of each
-/// list, at the same time the far half from its back.
+/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_by_tile`].
 fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &mut TileLists) {
-    let ListScratch {
-        order, fronts, backs, ..
-    } = scratch;
     let intersections = lists.offsets.last().map_or(0, |&end| end as usize);
     let out = Lists {
         covers,
         gaussians: Shared::new(stale(&mut lists.gaussians, intersections)),
         positions: Shared::new(stale(&mut lists.positions, intersections)),
     };
-    fronts.clone_from(&lists.offsets);
-    backs.clear();
-    backs.extend_from_slice(&lists.offsets[1..]);
-    let (near, far) = order.split_at(order.len() / 2);
-    rayon::join(
-        || {
-            for (k, &(_, i)) in near.iter().enumerate() {
-                if let Some(&(_, soon)) = near.get(k + AHEAD) {
-                    out.prefetch(soon);
+    scratch.fronts.clone_from(&lists.offsets);
+    match rayon::current_num_threads() {
+        1 | 2 => out.fill_from_both_ends(scratch, &lists.offsets),
+        threads => out.fill_by_segments(scratch, threads),
+    }
+}
+
+impl Lists<'_> {
+    /// The near half from the front of each list, at the same time the far half from its back: no work more than one
+    /// thread has.
+    fn fill_from_both_ends<T: Real>(&self, scratch: &mut ListScratch<T>, offsets: &[u32]) {
+        let ListScratch {
+            order, fronts, backs, ..
+        } = scratch;
+        backs.clear();
+        backs.extend_from_slice(&offsets[1..]);
+        let (near, far) = order.split_at(order.len() / 2);
+        rayon::join(
+            || self.fill_from_the_front(near, fronts),
+            || {
+                for (k, &(_, i)) in far.iter().enumerate().rev() {
+                    if let Some(&(_, soon)) = k.checked_sub(AHEAD).and_then(|k| far.get(k)) {
+                        self.prefetch(soon);
+                    }
+                    self.put(i, |tile| {
+                        let last = &mut backs[tile as usize];
+                        *last -= 1;
+                        *last
+                    });
                 }
-                out.put(i, |tile| {
-                    let next = &mut fronts[tile as usize];
-                    *next += 1;
-                    *next - 1
-                });
-            }
-        },
-        || {
-            for (k, &(_, i)) in far.iter().enumerate().rev() {
-                if let Some(&(_, soon)) = k.checked_sub(AHEAD).and_then(|k| far.get(k)) {
-                    out.prefetch(soon);
+            },
+        );
+    }
+
+    /// A segment of the order per thread, each where counting those before it says: one more walk through the tiles of
+    /// all Gaussians, which more than two threads make up for.
+    fn fill_by_segments<T: Real>(&self, scratch: &mut ListScratch<T>, segments: usize) {
+        let ListScratch {
+            order,
+            fronts,
+            segments: nexts,
+            ..
+        } = scratch;
+        let tiles = fronts.len() - 1;
+        let size = order.len().div_ceil(segments).max(1);
+        let nexts = filled(nexts, segments * tiles, 0);
+        nexts
+            .par_chunks_mut(tiles)
+            .zip(order.par_chunks(size))
+            .for_each(|(counts, segment)| {
+                for &(_, i) in segment {
+                    let (cover, local) = self.cover_of(i);
+                    for &tile in cover.tiles_of(local) {
+                        counts[tile as usize] += 1;
+                    }
                 }
-                out.put(i, |tile| {
-                    let last = &mut backs[tile as usize];
-                    *last -= 1;
-                    *last
-                });
+            });
+        for counts in nexts.chunks_exact_mut(tiles) {
+            for (next, front) in counts.iter_mut().zip(&mut *fronts) {
+                (*next, *front) = (*front, *front + *next);
             }
-        },
-    );
+        }
+        nexts
+            .par_chunks_mut(tiles)
+            .zip(order.par_chunks(size))
+            .for_each(|(nexts, segment)| self.fill_from_the_front(segment, nexts));
+    }
+
+    /// Lists the Gaussians of a part of the order, each tile's from `nexts` on.
+    #[inline(always)]
+    fn fill_from_the_front<K>(&self, order: &[(K, u32)], nexts: &mut [u32]) {
+        for (k, &(_, i)) in order.iter().enumerate() {
+            if let Some(&(_, soon)) = order.get(k + AHEAD) {
+                self.prefetch(soon);
+            }
+            self.put(i, |tile| {
+                let next = &mut nexts[tile as usize];
+                *next += 1;
+                *next - 1
+            });
+        }
+    }
 }
