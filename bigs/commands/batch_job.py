@@ -15,7 +15,7 @@ import torch
 
 from bigs.checks import InputError
 from bigs.commands.reconstruct import reconstruct
-from bigs.commands.run_folder import CONFIG, METRICS, SCENE, write_json
+from bigs.commands.run_folder import CONFIG, SCENE, read_scores, write_json
 from bigs.commands.series import PlannedRun
 from bigs.files import read_json
 
@@ -127,7 +127,7 @@ def run_job(job: Job) -> None:
     if error:
         write_status(folder, Status(**done | {"state": "failed", "error": error, "again": again}))
     else:
-        scores = read_json(folder / METRICS).get("result", {})
+        scores = read_scores(folder).get("result", {})
         write_status(folder, Status(**done | {"state": "finished", "scores": scores}))
 
 

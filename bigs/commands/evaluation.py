@@ -17,11 +17,10 @@ from bigs.commands.clips import open_clip
 from bigs.commands.paper_tables import beside_paper, mean_scores
 from bigs.commands.pictures import frame_scores, means, novel_scores, partly
 from bigs.commands.run_clip import hand_models_of_run, origin_of
-from bigs.commands.run_folder import METRICS, REPORT, load_run, write_json
+from bigs.commands.run_folder import METRICS, REPORT, load_run, read_scores, write_json
 from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
 from bigs.data.base import Clip
 from bigs.data.novel import CAMERAS
-from bigs.files import read_json
 from bigs.hand import HandModel, load_hand_models
 from bigs.losses.perceptual import VggWeights, perceptual_distance
 from bigs.losses.perceptual_file import load_perceptual_weights
@@ -95,12 +94,12 @@ def evaluate_run(
     """
     playback = load_run(run)
     origin = origin_of(run)
-    clip_path = plan.clip or (Path(origin["clip"]) if origin.get("clip") else None)
+    clip_path = plan.clip or origin.clip
     distance = _perceptual(plan.perceptual_weights)
     truth_path = plan.ground_truth or (find_ground_truth(clip_path) if clip_path else None)
     remarks: list[str] = []
     hand_models = hand_models_of_run(run)
-    hand_file = plan.hand_model or (Path(origin["hand_model"]) if origin.get("hand_model") else None)
+    hand_file = plan.hand_model or origin.hand_model
     if plan.hand_model is not None or (truth_path is not None and not is_own_truth(truth_path)):
         # A data set's poses are its truth on the hand that they were fitted with, and on no other.
         hand_models = load_hand_models(hand_file)
@@ -143,13 +142,12 @@ def evaluate_run(
     if distance is None:
         remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")
     remarks += _told_once(told)
-    path = run / METRICS
-    scores = read_json(path, "a run's scores") if path.exists() else {}
+    scores = read_scores(run)
     # An earlier score that cannot be had any more does not stand beside the reason.
     earlier = {key: v for key, v in scores.get("result", {}).items() if key not in told}
     begun = initial or scores.get("initial")
     scores = ({"initial": begun} if begun else {}) | {"result": earlier | result}
-    write_json(path, scores)
+    write_json(run / METRICS, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
     _write_scores(run / SCORES, scores)
     evaluation = Evaluation(playback.name, scores, frames, tuple(remarks), told)

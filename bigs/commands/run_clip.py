@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bigs.checks import InputError
 from bigs.commands.clips import open_clip
@@ -12,6 +12,7 @@ from bigs.commands.run_folder import CONFIG
 from bigs.data.base import Clip
 from bigs.files import read_yaml
 from bigs.hand import HandModel, load_hand_models
+from bigs.names import check_path
 from bigs.types import Side
 
 
@@ -29,9 +30,12 @@ def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | Non
         if len(clip) != frames:
             raise InputError(f"{given}: expected the {frames} frames of {run}, found {len(clip)}")
         return clip
+    stored = origin_of(run).clip
+    if stored is None:
+        return None
     try:
-        clip = open_clip(Path(origin_of(run)["clip"]), load_hand_models(None))
-    except (InputError, KeyError, TypeError):
+        clip = open_clip(stored, load_hand_models(None))
+    except InputError:
         return None
     return clip if len(clip) == frames else None
 
@@ -42,14 +46,29 @@ def hand_models_of_run(run: Path) -> Mapping[Side, HandModel]:
     Raises:
         InputError: the models' files are there and not as they should be.
     """
-    stored = origin_of(run).get("hand_model")
-    return load_hand_models(Path(stored) if stored and Path(stored).exists() else None)
+    stored = origin_of(run).hand_model
+    return load_hand_models(stored if stored is not None and stored.exists() else None)
 
 
-def origin_of(run: Path) -> Mapping[str, Any]:
+class Origin(NamedTuple):
+    """What a run was made from; None where its config.yaml does not tell."""
+
+    clip: Path | None
+    hand_model: Path | None
+
+
+def origin_of(run: Path) -> Origin:
     """What the run's config.yaml says; nothing when it cannot be read."""
     try:
         found = read_yaml(run / CONFIG)
     except InputError:
-        return {}
-    return found if isinstance(found, dict) else {}
+        found = {}
+    stored = found if isinstance(found, dict) else {}
+    return Origin(_path(stored.get("clip")), _path(stored.get("hand_model")))
+
+
+def _path(value: Any) -> Path | None:
+    try:
+        return Path(check_path(CONFIG, value))
+    except InputError:
+        return None

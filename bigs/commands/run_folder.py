@@ -9,6 +9,8 @@ from typing import Any
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, found_at, meant
+from bigs.data.fields import array_field, mapping_field
+from bigs.files import read_json
 from bigs.models.playback import Playback
 from bigs.models.playback_file import load_playback
 
@@ -37,6 +39,28 @@ def load_run(run: Path) -> Playback:
                 f"{run}: expected a run folder, found one with runs in it{meant(str(inside[0]))}"
             )
     return load_playback(run / SCENE)
+
+
+def read_scores(run: Path) -> dict[str, dict[str, float]]:
+    """What a run's `metrics.json` says: scores by key, of the result and of what it began with.
+
+    Returns:
+        Nothing where there is no such file.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path = run / METRICS
+    if not path.exists():
+        return {}
+    stored = mapping_field(str(path), read_json(path, "a run's scores"))
+    return {
+        column: {
+            key: float(array_field(f"{path}: {column}.{key}", value, (), finite=False))
+            for key, value in mapping_field(f"{path}: {column}", scores).items()
+        }
+        for column, scores in stored.items()
+    }
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

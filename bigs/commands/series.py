@@ -9,7 +9,7 @@ from typing import Any
 
 from bigs.checks import InputError
 from bigs.commands.reconstruct import reconstruct, run_origin
-from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
+from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, read_scores, write_json
 from bigs.commands.run_log import read_log
 from bigs.files import read_json, read_yaml
 from bigs.train.config import RunConfig
@@ -78,7 +78,7 @@ def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> Finis
     try:
         if not reused:
             _run(run, listen)
-        scores = _read(run.folder / METRICS)
+        scores = read_scores(run.folder)
         skipped = [row["text"] for row in read_log(run.folder / LOG) if row["event"] == "skipped"]
         return FinishedRun(scores, _read(run.folder / TIMES), skipped, reused=reused)
     # Whatever stops one run is told in its row; the others are worth having.
