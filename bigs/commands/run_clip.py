@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bigs.checks import InputError
+from bigs.checks import InputError, shown
 from bigs.commands.clips import open_clip
 from bigs.commands.run_folder import CONFIG
 from bigs.data.base import Clip
@@ -55,6 +55,7 @@ class Origin(NamedTuple):
 
     clip: Path | None
     hand_model: Path | None
+    version: str | None  # of bigs
 
 
 def origin_of(run: Path) -> Origin:
@@ -64,7 +65,12 @@ def origin_of(run: Path) -> Origin:
     except InputError:
         found = {}
     stored = found if isinstance(found, dict) else {}
-    return Origin(_path(stored.get("clip")), _path(stored.get("hand_model")))
+    version = stored.get("bigs")
+    return Origin(
+        _path(stored.get("clip")),
+        _path(stored.get("hand_model")),
+        version if version is None or isinstance(version, str) else shown(version),
+    )
 
 
 def _path(value: Any) -> Path | None:

@@ -44,12 +44,12 @@ def check_same_options(run: Path, config: RunConfig, origin: Mapping[str, str | 
         more = f" (and {len(differing) - 1} more settings that differ)" if len(differing) > 1 else ""
         raise InputError(f"--set {path}: expected {old}, as the run has it, found {new}{more}; {again}")
     before = origin_of(run)
-    if before.get("bigs", origin["bigs"]) != origin["bigs"]:
+    if before.version not in (None, origin["bigs"]):
         raise InputError(
-            f"{run}: expected a run of bigs {origin['bigs']}, found one of {before['bigs']}; "
+            f"{run}: expected a run of bigs {origin['bigs']}, found one of {before.version}; "
             "choose another --out"
         )
-    models = before.get("hand_model"), origin["hand_model"]
+    models = before.hand_model, origin["hand_model"]
     if (models[0] is None) != (models[1] is None):
         old, new = ("the built-in hand" if model is None else model for model in models)
         raise InputError(f"--hand-model: expected {old}, as the run has it, found {new}")

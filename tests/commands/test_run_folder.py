@@ -49,10 +49,10 @@ def test_a_run_without_scores_has_none(tmp_path: Path) -> None:
 )
 def test_an_origin_that_is_no_path_is_none(tmp_path: Path, value: str) -> None:
     (tmp_path / "config.yaml").write_text(f"clip: {value}\nhand_model: {value}\n")
-    assert origin_of(tmp_path) == Origin(None, None)
+    assert origin_of(tmp_path) == Origin(None, None, None)
     assert clip_of_run(tmp_path, 3) is None
 
 
 def test_an_origin_is_two_paths(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("clip: some/clip\nhand_model: null\n")
-    assert origin_of(tmp_path) == Origin(Path("some/clip"), None)
+    (tmp_path / "config.yaml").write_text("bigs: 0.1.0\nclip: some/clip\nhand_model: null\n")
+    assert origin_of(tmp_path) == Origin(Path("some/clip"), None, "0.1.0")
