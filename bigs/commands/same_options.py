@@ -49,7 +49,8 @@ def check_same_options(run: Path, config: RunConfig, origin: Mapping[str, str | 
             f"{run}: expected a run of bigs {origin['bigs']}, found one of {before.version}; "
             "choose another --out"
         )
-    models = before.hand_model, origin["hand_model"]
+    own = None if before.hand_model is None else str(before.hand_model)
+    models = own, origin["hand_model"]
     if (models[0] is None) != (models[1] is None):
         old, new = ("the built-in hand" if model is None else model for model in models)
         raise InputError(f"--hand-model: expected {old}, as the run has it, found {new}")
