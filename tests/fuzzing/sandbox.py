@@ -290,8 +290,9 @@ def _faults(target: Target, code: int, said: str, out: str, seen: dict[str, Any]
     if "Warning" in said:
         faults.append(f"warning: {said[:300]}")
     lines = said.splitlines()
-    if code > 0 and len(lines) != 1:
-        faults.append(f"{len(lines)} lines: {said[:300]}")
+    # Where there is no terminal, a command says before how far it is.
+    if code > 0 and [line.startswith("bigs: ") for line in lines] != [False] * (len(lines) - 1) + [True]:
+        faults.append(f"no single sentence: {said[:300]}")
     if any(len(line) > LONGEST_SENTENCE for line in lines):
         faults.append(f"{max(map(len, lines))} characters")
     if any(not (c.isprintable() or c == "\n") for c in said):
