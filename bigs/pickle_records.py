@@ -30,6 +30,10 @@ _LONG_INTEGER, _MAX_LONG_INTEGERS = 1 << 64, 1000
 # Arguments of what may be called; a tensor has seven.
 _MAX_ARGUMENTS = 16
 
+# Classes whose instances are dictionaries: the second is what HOLD saves its predictions as.
+HOLD_DICTIONARY: Global = ("common.xdict", "xdict")
+DICTIONARIES: frozenset[Global] = frozenset({("collections", "OrderedDict"), HOLD_DICTIONARY})
+
 # The names a pickle may use, as canonical (module, qualified name) pairs; see `_canonical`.
 CONTAINERS: frozenset[Global] = frozenset(
     {
@@ -107,7 +111,7 @@ class PersistentId(Record):
 
 
 class _DictRecord(Record):
-    """An ordered dict; the only record that items are stored into."""
+    """A dict of another class than `dict`; the only record that items are stored into."""
 
     __slots__ = ("entries",)
     entries: dict[Any, Any]
@@ -121,10 +125,12 @@ class _DictRecord(Record):
 class _RecordingUnpickler(pickle.Unpickler):
     """Runs a pickle's program with every global replaced by a record class made for this one load."""
 
-    def __init__(self, file: BinaryIO, allow: frozenset[Global], *, persistent: bool = False) -> None:
+    def __init__(
+        self, file: BinaryIO, allow: frozenset[Global], references: list[PersistentId] | None
+    ) -> None:
         super().__init__(file, encoding="latin1")
         self._allow = allow
-        self._persistent = persistent
+        self._references = references
         self._classes: dict[Global, type[Record]] = {}
 
     def find_class(self, module: str, name: str) -> type[Record]:
@@ -132,14 +138,15 @@ class _RecordingUnpickler(pickle.Unpickler):
         if key not in self._allow:
             raise Refused(f"{module}.{name}")
         if key not in self._classes:
-            base = _DictRecord if key == ("collections", "OrderedDict") else Record
+            base = _DictRecord if key in DICTIONARIES else Record
             self._classes[key] = type(name, (base,), {"__slots__": (), "key": key})
         return self._classes[key]
 
     def persistent_load(self, pid: Any) -> Record:
-        if not self._persistent:
+        if self._references is None:
             raise pickle.UnpicklingError("a reference to data outside the pickle")
-        return PersistentId(pid)
+        self._references.append(PersistentId(pid))
+        return self._references[-1]
 
 
 class _Part(NamedTuple):
@@ -242,12 +249,20 @@ def _whole(parts: Sequence[_Part]) -> _Part:
     return _Part(values, depth)
 
 
-def load_records(stream: io.BytesIO, allow: frozenset[Global], *, persistent: bool = False) -> Any:
-    """The next pickle in `stream` with every global call left as a record."""
+def load_records(
+    stream: io.BytesIO, allow: frozenset[Global], *, references: list[PersistentId] | None = None
+) -> Any:
+    """The next pickle in `stream` with every global call left as a record.
+
+    Args:
+        stream: at the pickle's beginning; left at its end.
+        allow: the names that it may use.
+        references: takes what it says of data outside itself; without it there must be none.
+    """
     start = stream.tell()
     _Rehearsal().follow(stream)
     stream.seek(start)
-    return _RecordingUnpickler(stream, allow, persistent=persistent).load()
+    return _RecordingUnpickler(stream, allow, references).load()
 
 
 def _canonical(module: str, name: str) -> Global:

@@ -67,7 +67,7 @@ def restricted_load(file: BinaryIO, *, name: str, allow: frozenset[Global] = ARR
     """
     try:
         data = file.read()
-        return _Builder(allow, len(data)).value(load_records(io.BytesIO(data), allow))
+        return Builder(allow, len(data)).value(load_records(io.BytesIO(data), allow))
     except Refused as refusal:
         raise InputError(
             f"{name}: expected a pickle of plain data, found the global '{refusal}', which is refused "
@@ -98,8 +98,11 @@ def load_npy(path: str | Path, *, allow: frozenset[Global] = TENSORS) -> Any:
     return array.item() if array.shape == () else array
 
 
-class _Builder:
-    """Turns records into values, depth first. Shared parts stay shared; a cycle is an error."""
+class Builder:
+    """Turns records into values, depth first. Shared parts stay shared; a cycle is an error.
+
+    `bigs.torch_files` adds what only files of torch have.
+    """
 
     def __init__(self, allow: frozenset[Global], size: int) -> None:
         """`size` is that of the file in bytes, which bounds what is made of it."""
@@ -123,7 +126,7 @@ class _Builder:
             raise ValueError(f"data nested more than {MAX_DEPTH} levels deep")
         self._active.add(id(raw))
         self._alive.append(raw)
-        result = self._record(raw) if isinstance(raw, Record) else self._container(raw)
+        result = self.record(raw) if isinstance(raw, Record) else self._container(raw)
         self._active.discard(id(raw))
         self._done[id(raw)] = result
         self._count(result)
@@ -183,7 +186,8 @@ class _Builder:
         what = ".".join(raw.key) if isinstance(raw, type) and issubclass(raw, Record) else type(raw).__name__
         raise TypeError(f"{what} where data should be")
 
-    def _record(self, record: Record) -> Any:
+    def record(self, record: Record) -> Any:
+        """What a record stands for."""
         if record.key == ("copyreg", "_reconstructor"):
             state, (cls, *_) = record.state, record.args
             if not (isinstance(cls, type) and issubclass(cls, Record)):
@@ -208,10 +212,8 @@ class _Builder:
     def storage(self, raw: bytes) -> torch.Tensor:
         """A flat tensor from the stream in which `torch.save` wrote one storage before it used zip files."""
         stream = io.BytesIO(raw)
-        magic, version, system = (load_records(stream, frozenset()) for _ in range(3))
-        if magic != _TORCH_LEGACY_MAGIC or version != 1001 or system.get("little_endian") is not True:
-            raise ValueError("a torch storage of an unknown format")
-        reference = load_records(stream, self._allow, persistent=True)
+        check_legacy_head(stream)
+        reference = load_records(stream, self._allow, references=[])
         keys = load_records(stream, frozenset())
         if type(reference) is not PersistentId:
             raise TypeError("a torch storage that is not a storage")
@@ -226,6 +228,15 @@ class _Builder:
         return torch.from_numpy(_from_bytes(stream.read(count * dtype.itemsize), dtype, (count,), "C"))
 
 
+def check_legacy_head(stream: io.BytesIO) -> None:
+    """Read the three pickles with which torch began its files before they were zip files; ValueError if there
+    are others."""
+    magic, version, system = (load_records(stream, frozenset()) for _ in range(3))
+    little = type(system) is dict and system.get("little_endian") is True
+    if magic != _TORCH_LEGACY_MAGIC or version != 1001 or not little:
+        raise ValueError("no file of torch, or one of an unknown format")
+
+
 def _from_bytes(data: bytes, dtype: np.dtype, shape: tuple[int, ...], order: Any) -> np.ndarray:
     flat = np.frombuffer(data, dtype) if data else np.empty(0, dtype)
     return np.reshape(flat, shape, order="F" if order == "F" else "C").copy(order="K")
@@ -237,7 +248,7 @@ def _shape(value: Any) -> tuple[int, ...]:
     return tuple(int(n) for n in value)
 
 
-def _build_dtype(builder: _Builder, record: Record) -> np.dtype:
+def _build_dtype(builder: Builder, record: Record) -> np.dtype:
     code = record.args[0]
     state = builder.value(record.state) or (3, "|", None, None, None)
     if (
@@ -250,7 +261,7 @@ def _build_dtype(builder: _Builder, record: Record) -> np.dtype:
     return dtype.newbyteorder(">") if state[1] == ">" else dtype
 
 
-def _dtype(builder: _Builder, raw: Any) -> np.dtype:
+def _dtype(builder: Builder, raw: Any) -> np.dtype:
     """A dtype that is one: NumPy would make one of a list, and of what the list holds."""
     dtype = builder.value(raw)
     if not isinstance(dtype, np.dtype):
@@ -258,7 +269,7 @@ def _dtype(builder: _Builder, raw: Any) -> np.dtype:
     return dtype
 
 
-def _plain_numbers(builder: _Builder, raw: Any) -> np.ndarray:
+def _plain_numbers(builder: Builder, raw: Any) -> np.ndarray:
     """An array of numbers, or a list of some as one; never of text, which NumPy pads to the longest."""
     value = builder.value(raw)
     waiting = [value]
@@ -274,7 +285,7 @@ def _plain_numbers(builder: _Builder, raw: Any) -> np.ndarray:
     return array
 
 
-def _build_array(builder: _Builder, record: Record) -> np.ndarray:
+def _build_array(builder: Builder, record: Record) -> np.ndarray:
     cls = record.args[0]
     if not (isinstance(cls, type) and issubclass(cls, Record) and cls.key == ("numpy", "ndarray")):
         raise TypeError("an array that is not a plain numpy.ndarray")
@@ -289,19 +300,19 @@ def _build_array(builder: _Builder, record: Record) -> np.ndarray:
     return np.reshape(array, shape, order="F" if fortran else "C")
 
 
-def _build_array_from_buffer(builder: _Builder, record: Record) -> np.ndarray:
+def _build_array_from_buffer(builder: Builder, record: Record) -> np.ndarray:
     data, raw_dtype, raw_shape, order, *axes = record.args
     dtype, shape = _dtype(builder, raw_dtype), _shape(builder.value(raw_shape))
     array = _from_bytes(builder.buffer(data), dtype, shape, order)
     return array.transpose(builder.value(axes[0])) if order == "K" and axes else array
 
 
-def _build_scalar(builder: _Builder, record: Record) -> Any:
+def _build_scalar(builder: Builder, record: Record) -> Any:
     dtype, data = _dtype(builder, record.args[0]), builder.buffer(record.args[1])
     return _from_bytes(data, dtype, (), "C")[()]
 
 
-def _build_sparse(builder: _Builder, record: Record) -> Any:
+def _build_sparse(builder: Builder, record: Record) -> Any:
     state = record.state
     matrix_type = getattr(scipy.sparse, record.key[1])
     parts = tuple(_plain_numbers(builder, state[part]) for part in ("data", "indices", "indptr"))
@@ -317,7 +328,7 @@ def _build_sparse(builder: _Builder, record: Record) -> Any:
     return matrix
 
 
-def _build_chumpy(builder: _Builder, record: Record) -> np.ndarray:
+def _build_chumpy(builder: Builder, record: Record) -> np.ndarray:
     """A `Ch` holds its array as `x`; a `Select` takes `idxs` of `a`, flattened, into `preferred_shape`."""
     state = record.state
     if record.key[1] == "Ch":
@@ -329,7 +340,7 @@ def _build_chumpy(builder: _Builder, record: Record) -> np.ndarray:
     return picked.reshape(_plain_numbers(builder, state["preferred_shape"]).tolist())
 
 
-def _build_tensor(builder: _Builder, record: Record) -> torch.Tensor:
+def _build_tensor(builder: Builder, record: Record) -> torch.Tensor:
     storage, offset, size, stride = (builder.value(part) for part in record.args[:4])
     if not isinstance(storage, torch.Tensor):
         raise TypeError("a torch tensor without a storage")
@@ -337,31 +348,34 @@ def _build_tensor(builder: _Builder, record: Record) -> torch.Tensor:
     # A stride of 0 could announce a tensor far larger than the file that holds it.
     if math.prod(size) > storage.numel():
         raise ValueError(f"a torch tensor of size {list(size)} in a storage of {storage.numel()} values")
-    return storage.as_strided(size, stride, offset).clone()
+    tensor = storage.as_strided(size, stride, offset)
+    is_all = tensor.numel() == storage.numel() and tensor.is_contiguous()
+    return tensor if is_all else tensor.clone()
 
 
-def _build_from_iterable(make: type) -> Callable[[_Builder, Record], Any]:
-    def build(builder: _Builder, record: Record) -> Any:
+def _build_from_iterable(make: type) -> Callable[[Builder, Record], Any]:
+    def build(builder: Builder, record: Record) -> Any:
         given = [builder.value(arg) for arg in record.args[:1]]
         return make(*(value if make is tuple else builder.keys(value) for value in given))
 
     return build
 
 
-def _build_dict(builder: _Builder, record: Record) -> dict[Any, Any]:
+def build_dict(builder: Builder, record: Record) -> dict[Any, Any]:
+    """A dict from a record of one, as it was made and with the entries that were stored later."""
     given = builder.value(record.args[0]) if record.args else {}
     builder.spend(_BYTES_PER_MEMBER * builder.size(given))
     return dict(given) | builder.value(getattr(record, "entries", {}))
 
 
-def _build_encoded(builder: _Builder, record: Record) -> bytes:
+def _build_encoded(builder: Builder, record: Record) -> bytes:
     """Python 3 writes bytes as `codecs.encode(text, "latin1")` in the protocols that Python 2 can read."""
     if record.args[1:] not in (("latin1",), ("latin-1",)):
         raise ValueError(f"the text encoding {shown(record.args[1:])}")
     return builder.value(record.args[0]).encode("latin1")
 
 
-_BUILDERS: dict[Global, Callable[[_Builder, Record], Any]] = {
+_BUILDERS: dict[Global, Callable[[Builder, Record], Any]] = {
     ("builtins", "set"): _build_from_iterable(set),
     ("builtins", "frozenset"): _build_from_iterable(frozenset),
     ("builtins", "bytes"): lambda builder, record: builder.buffer(record.args[0]) if record.args else b"",
@@ -375,7 +389,7 @@ _BUILDERS: dict[Global, Callable[[_Builder, Record], Any]] = {
     ("torch", "Size"): _build_from_iterable(tuple),
     ("torch._utils", "_rebuild_tensor"): _build_tensor,
     ("torch._utils", "_rebuild_tensor_v2"): _build_tensor,
-    ("collections", "OrderedDict"): _build_dict,
+    ("collections", "OrderedDict"): build_dict,
     ("torch.storage", "_load_from_bytes"): lambda builder, record: builder.storage(
         builder.buffer(record.args[0])
     ),

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
 from bigs.checks import InputError, check_finite, check_shape
-from bigs.files import check_regular
-
-# What torch raises for files that are no checkpoint, are cut short, or hold more than plain data.
-_UNREADABLE = (
-    SafetensorError,
-    pickle.UnpicklingError,
-    RuntimeError,
-    OSError,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-)
+from bigs.files import check_regular, open_regular
+from bigs.torch_files import load_torch
 
 
 def load_weights(path: Path, network: str) -> dict[str, Tensor]:
@@ -37,16 +23,16 @@ def load_weights(path: Path, network: str) -> dict[str, Tensor]:
     Raises:
         InputError: the file is missing or unreadable, or holds other things than tensors by name.
     """
-    check_regular(path, f"a file with {network}")
-    try:
-        if path.suffix == ".safetensors":
+    what, wanted = f"a file with {network}", "tensors by name (.safetensors or .pth)"
+    if path.suffix == ".safetensors":
+        check_regular(path, what)
+        try:
             return load_file(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except _UNREADABLE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            f"{path}: expected tensors by name (.safetensors or .pth), found another file ({reason})"
-        ) from error
+        except (SafetensorError, OSError, ValueError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(f"{path}: expected {wanted}, found another file ({reason})") from None
+    with open_regular(path, what) as stream:
+        content = load_torch(str(path), stream, wanted)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
     if not isinstance(content, dict):

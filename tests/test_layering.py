@@ -18,7 +18,18 @@ ROOT = Path(bigs.__file__).parent
 
 # A part is a top-level module or package of bigs; "bigs" itself is its version. Each may import itself and
 # what its entry names. Siblings are apart; what they share lies below them.
-BELOW = {"types", "checks", "names", "files", "archives", "checksum", "atomic", "unpickle", "weights"}
+BELOW = {
+    "types",
+    "checks",
+    "names",
+    "files",
+    "archives",
+    "checksum",
+    "atomic",
+    "unpickle",
+    "torch_files",
+    "weights",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "bigs": set(),
     "types": set(),
@@ -31,7 +42,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "atomic": set(),
     "pickle_records": set(),
     "unpickle": {"checks", "files", "archives", "pickle_records"},
-    "weights": {"checks", "files"},
+    "torch_files": {"checks", "archives", "pickle_records", "unpickle"},
+    "weights": {"checks", "files", "torch_files"},
     "_raster": {"raster"},  # the compiled module's stub names the settings class
     "geometry": BELOW,
     "raster": BELOW | {"geometry", "_raster"},

@@ -9,8 +9,6 @@ clip lacks has no keys.
 from __future__ import annotations
 
 import io
-import pickle
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO
@@ -20,7 +18,9 @@ import torch
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_finite, check_shape, shown
+from bigs.files import open_regular
 from bigs.names import check_name, check_path
+from bigs.torch_files import load_torch
 from bigs.types import ENTITIES, SIDES, HandObjectTrajectory, Side
 
 # Keys have two parts.
@@ -31,8 +31,6 @@ _GL_FROM_CV = np.array([1.0, -1.0, -1.0])
 _SCENE_RADIUS = 2.0
 # Two float16 numbers of about a metre, subtracted, are this exact at best.
 _HALF_TOLERANCE = 2e-3
-# HOLD saves its dictionary as a class of its own; it is read as the dictionary it is.
-_HOLD_DICTIONARY: list[Any] = [(OrderedDict, "common.xdict.xdict")]
 
 
 def write_challenge(
@@ -208,26 +206,12 @@ def _faces(
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(f"{path}: expected a challenge prediction file, found no such file")
-    with path.open("rb") as stream:
+    with open_regular(path, "a challenge prediction file") as stream:
         return _parse(str(path), stream)
 
 
 def _parse(where: str, stream: BinaryIO) -> dict[str, Any]:
-    try:
-        try:
-            content = torch.load(stream, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:
-            stream.seek(0)
-            with torch.serialization.safe_globals(_HOLD_DICTIONARY):
-                content = torch.load(stream, map_location="cpu", weights_only=True)
-    except Exception as error:  # damage and forbidden contents show up as many kinds of error
-        reason = str(error).strip().splitlines()
-        raise InputError(
-            f"{where}: expected plain containers and tensors, found what cannot be read safely "
-            f"({reason[-1] if reason else type(error).__name__})"
-        ) from error
+    content = load_torch(where, stream, "plain containers and tensors")
     if not isinstance(content, dict):
         raise InputError(f"{where}: expected a dictionary, found {type(content).__name__}")
     try:

@@ -11,13 +11,16 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
+from bigs.archives import open_zip, read_member
 from bigs.atomic import atomic_write
-from bigs.checks import ARCHIVE_ERRORS, InputError, meant, neighbour, shown
+from bigs.checks import InputError, shown
 from bigs.export.challenge import validate_challenge
+from bigs.files import MIB, open_regular, read_bytes
+from bigs.torch_files import load_torch
 from bigs.types import ENTITIES
 
 # The challenge's clips, and the paper's: the nine grasps of the hidden subject 3, seen by camera 1.
@@ -34,8 +37,8 @@ TEST_OBJECTS = (
 )
 TEST_SEQUENCES = tuple(f"arctic_s03_{name}_grab_01_1" for name in TEST_OBJECTS)
 FOLDER = "arctic_preds"
-# Predictions are tens of megabytes; more than this is a forged size.
-_MAX_BYTES = 2 << 30
+# Predictions are tens of megabytes, and hundreds for large meshes.
+_MAX_BYTES = 2048 * MIB
 
 
 class SubmittedClip(NamedTuple):
@@ -69,10 +72,10 @@ def write_submission(
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(predictions):
-            if not file.is_file():
-                raise InputError(f"{file}: expected a challenge prediction file, found no such file")
-            content = file.read_bytes()
-            archive.writestr(f"{FOLDER}/{file.stem}.pt", _as_hold(content) if hold_class else content)
+            content = read_bytes(file, "a challenge prediction file", _MAX_BYTES)
+            archive.writestr(
+                f"{FOLDER}/{file.stem}.pt", _as_hold(str(file), content) if hold_class else content
+            )
     found = _check_archive(str(path), buffer, sequences)
     with atomic_write(path) as target:
         target.write(buffer.getbuffer())
@@ -85,20 +88,12 @@ def check_submission(path: str | Path, sequences: Sequence[str] = TEST_SEQUENCES
     Raises:
         InputError: the first thing that is wrong.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(
-            f"{path}: expected a submission (a zip file), found no such file{meant(neighbour(path))}"
-        )
-    return _check_archive(str(path), io.BytesIO(path.read_bytes()), sequences)
+    with open_regular(path, "a submission (a zip file)") as stream:
+        return _check_archive(str(path), stream, sequences)
 
 
-def _check_archive(where: str, buffer: io.BytesIO, sequences: Sequence[str]) -> list[SubmittedClip]:
-    try:
-        archive = zipfile.ZipFile(buffer)
-    except zipfile.BadZipFile as error:
-        raise InputError(f"{where}: expected a zip file, found {str(error).lower()}") from None
-    with archive:
+def _check_archive(where: str, stream: BinaryIO, sequences: Sequence[str]) -> list[SubmittedClip]:
+    with open_zip(where, stream) as archive:
         members = [info for info in archive.infolist() if not info.is_dir()]
         for info in members:
             folder, _, name = info.filename.rpartition("/")
@@ -106,23 +101,15 @@ def _check_archive(where: str, buffer: io.BytesIO, sequences: Sequence[str]) -> 
                 raise InputError(f"{where}: expected only {FOLDER}/SEQUENCE.pt, found {shown(info.filename)}")
             if info.file_size > _MAX_BYTES:
                 raise InputError(
-                    f"{where}: {info.filename}: expected at most 2 GiB, found {info.file_size} bytes"
+                    f"{where}: {shown(info.filename)}: expected at most {_MAX_BYTES} bytes, found "
+                    f"{info.file_size}"
                 )
         names = [info.filename.removeprefix(f"{FOLDER}/").removesuffix(".pt") for info in members]
         _check_names(where, names, sequences)
         return [
-            _check_prediction(f"{where}: {info.filename}", name, _member(archive, where, info))
+            _check_prediction(f"{where}: {info.filename}", name, read_member(where, archive, info))
             for info, name in zip(members, names, strict=True)
         ]
-
-
-def _member(archive: zipfile.ZipFile, where: str, info: zipfile.ZipInfo) -> bytes:
-    try:
-        return archive.read(info)
-    except ARCHIVE_ERRORS as error:
-        raise InputError(
-            f"{where}: {info.filename}: expected a whole file, found a damaged one ({error})"
-        ) from None
 
 
 def _check_names(where: str, names: Sequence[str], sequences: Sequence[str]) -> None:
@@ -177,9 +164,9 @@ class _HoldPickler(_PythonPickler):
     dispatch = _PythonPickler.dispatch | {type: save_type}
 
 
-def _as_hold(content: bytes) -> bytes:
+def _as_hold(where: str, content: bytes) -> bytes:
     """A prediction file whose dictionary is of HOLD's class."""
-    stored = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    stored = load_torch(where, io.BytesIO(content), "a challenge prediction")
     buffer = io.BytesIO()
     pickler: Any = SimpleNamespace(Pickler=_HoldPickler, __name__=pickle.__name__)
     torch.save(_HoldDictionary(stored), buffer, pickle_module=pickler)

@@ -74,7 +74,7 @@ def load_hand_model(path: str | Path, side: Side) -> HandModel:
         raise InputError(
             f"{path}: expected {FILE_STEMS[side]}.npz or {FILE_STEMS[side]}.pkl in this folder, found neither"
         )
-    if not file.is_file():
+    if file.is_dir() or not file.exists():
         raise InputError(
             f"{file}: expected a hand model file (.npz or .pkl) or a folder of them, found {found_at(file)}"
         )

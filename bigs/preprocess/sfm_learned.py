@@ -12,8 +12,9 @@ from kornia.feature import DISK, LightGlue
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.files import check_regular
+from bigs.files import open_regular
 from bigs.motion.features import NOTHING, FeatureConfig, FrameFeatures, crop_box, enlargement
+from bigs.torch_files import load_torch
 
 # DISK's network halves its input four times.
 _MULTIPLE = 16
@@ -38,10 +39,11 @@ def load_matcher(disk_file: Path, glue_file: Path) -> LearnedMatcher:
     """
     disk = DISK()
     stored = _read_weights(disk_file)
-    _load(disk, stored.get("extractor", stored), disk_file)
+    inside = stored.get("extractor", stored)
+    _load(disk, inside if isinstance(inside, Mapping) else stored, disk_file)
     # LightGlue fetches weights by itself unless it is told of no features.
     glue = LightGlue(None, input_dim=128, weights=None)  # type: ignore[arg-type]
-    renamed = {_present_name(name): value for name, value in _read_weights(glue_file).items()}
+    renamed = {_present_name(str(name)): value for name, value in _read_weights(glue_file).items()}
     _load(glue, renamed, glue_file)
     return LearnedMatcher(disk.eval(), glue.eval())
 
@@ -112,11 +114,8 @@ def _as_input(features: FrameFeatures, size: tuple[int, int]) -> dict[str, torch
 
 
 def _read_weights(file: Path) -> Mapping[str, Any]:
-    check_regular(file, "a file of weights")
-    try:
-        stored = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds
-        raise InputError(f"{file}: expected weights that torch reads, found {str(error)[:80]}") from None
+    with open_regular(file, "a file of weights") as stream:
+        stored = load_torch(str(file), stream, "weights that torch reads")
     if not isinstance(stored, Mapping):
         raise InputError(f"{file}: expected a dictionary of weights, found {type(stored).__name__}")
     return stored

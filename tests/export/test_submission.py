@@ -159,12 +159,12 @@ def test_other_files_are_refused(archive: Path, name: str) -> None:
 
 
 def test_damaged_zips_are_named(tmp_path: Path, archive: Path, predictions: list[Path]) -> None:
-    with pytest.raises(InputError, match="found nothing"):
+    with pytest.raises(InputError, match="found no such file"):
         check_submission(tmp_path / "absent.zip", NAMES)
     damaged = bytearray(archive.read_bytes())
     damaged[200] ^= 0xFF
     archive.write_bytes(damaged)
-    with pytest.raises(InputError, match="expected a whole file, found a damaged one"):
+    with pytest.raises(InputError, match="expected a whole member, found a damaged one"):
         check_submission(archive, NAMES)
     archive.write_bytes(b"PK")
     with pytest.raises(InputError, match="expected a zip file"):

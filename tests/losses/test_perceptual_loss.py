@@ -200,12 +200,12 @@ class Bomb:
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ("missing", "expected a file with VGG-16, found none"),
-        ("folder", "expected a file with VGG-16, found none"),
-        ("text", "expected tensors by name .* found another file"),
-        ("empty", "expected tensors by name .* found another file"),
-        ("cut short", "expected tensors by name .* found another file"),
-        ("code", "expected tensors by name .* found another file"),
+        ("missing", "expected a file with VGG-16, found no such file"),
+        ("folder", "expected a file with VGG-16, found a folder"),
+        ("text", "expected tensors by name .* found what cannot be read safely"),
+        ("empty", "expected tensors by name .* found what cannot be read safely"),
+        ("cut short", "expected tensors by name .* found file is not a zip file"),
+        ("code", "expected tensors by name .* found what cannot be read safely"),
         ("list", "expected tensors by name, found list"),
         ("channels alone", "expected VGG-16 as torchvision names it, found no features.0.weight"),
         ("a layer", "found no features.17.bias"),

@@ -81,7 +81,7 @@ def test_exhaustive_pairs_are_all_pairs() -> None:
 def test_other_files_are_refused_by_name(files: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"glue\.pth: expected the weights of DISK.*missing"):
         load_matcher(files[1], files[1])
-    with pytest.raises(InputError, match=r"none\.pth: expected a file of weights, found nothing"):
+    with pytest.raises(InputError, match=r"none\.pth: expected a file of weights, found no such file"):
         load_matcher(files[0], tmp_path / "none.pth")
     (tmp_path / "text.pth").write_text("no weights")
     with pytest.raises(InputError, match=r"text\.pth: expected weights that torch reads"):
