@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 
 import pytest
+import torch
 from command_line import Answer, assert_refused
 
 from bigs.checks import InputError
@@ -27,6 +29,30 @@ def test_an_error_that_nobody_foresaw(
     for word in ("KeyError", "'a\\nkey'", "report", "--debug"):
         assert word in sentence
     assert any("Traceback" in line for line in traceback) == ("--debug" in arguments)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError("std::bad_alloc"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        None,  # torch's own, of a tensor that no machine holds
+    ],
+)
+def test_memory_that_cannot_be_had(
+    call: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, error: Exception | None
+) -> None:
+    def fails() -> None:
+        if error is None:
+            torch.empty(1 << 60)
+        else:
+            raise error
+
+    monkeypatch.setattr("bigs.commands.doctor.examine", fails)
+    answer = call("doctor")
+    assert (answer.code, answer.out) == (6, "")
+    assert len(answer.err.splitlines()) == 1 and "expected enough memory" in answer.err
 
 
 def test_an_integer_that_python_does_not_print(

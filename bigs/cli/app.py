@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import re
@@ -61,6 +62,10 @@ GROUPS = {
     "bench": "Measure how fast and how exact this is.",
 }
 
+# What torch, FFmpeg and the system say where Python would raise MemoryError.
+_NO_MEMORY = re.compile(
+    r"can't allocate memory|cannot allocate memory|std::bad_alloc|out of memory", re.IGNORECASE
+)
 # How much of the text of an error that nobody foresaw is told.
 _REASON = 200
 
@@ -97,10 +102,16 @@ def _told(error: Exception) -> tuple[str, int]:
         return str(error), 2
     if isinstance(error, FloatingPointError):
         return f"{error}; the last checkpoint is kept", 3
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) and error.errno != errno.ENOMEM:
         place = f"{error.filename}: " if error.filename else ""
         reason = error.strerror or shown(error)
         return f"{place}expected a file or folder that can be read or written, found: {reason}", 4
+    if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+        return (
+            "expected enough memory for this command, found that the system grants no more; smaller or fewer "
+            "pictures, or other programs closed, may help",
+            6,
+        )
     reason = " ".join(str(error).split())
     told = f"{type(error).__name__}{f' ({reason[:_REASON]})' if reason else ''}"
     return (

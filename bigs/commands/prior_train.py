@@ -17,8 +17,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, found_at
+from bigs.checks import InputError, check_faces, check_finite, found_at
 from bigs.commands.prior import read_state, state_path
+from bigs.data.fields import LARGEST
+from bigs.data.mesh_files import MESH_SUFFIXES, load_mesh_file
+from bigs.files import read_bytes
 from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
@@ -37,7 +40,6 @@ from bigs.train.guided import render_object
 __all__ = ["PixelConfig", "PixelTrainingConfig", "TrainedPrior", "train_prior"]
 
 FORMAT = "bigs-pixel-state-1"
-_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 _GAUSSIANS = 3000
 # Standard deviation of a Gaussian on the mesh, in spacings of its neighbours, and along the normal.
 _SPREAD, _FLATNESS = 0.6, 0.35
@@ -117,9 +119,9 @@ def train_prior(
 def _mesh_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of meshes, found {found_at(folder)}")
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
     if not files:
-        raise InputError(f"{folder}: expected meshes ({', '.join(_SUFFIXES)}), found none")
+        raise InputError(f"{folder}: expected meshes ({', '.join(MESH_SUFFIXES)}), found none")
     return files
 
 
@@ -127,7 +129,7 @@ def _digest(files: list[Path], config: PixelTrainingConfig, views: int, up: str)
     settings = json.dumps([asdict(config), views, up, [file.name for file in files]])
     digest = hashlib.sha256(settings.encode())
     for file in files:
-        digest.update(file.read_bytes())
+        digest.update(read_bytes(file, "a triangle mesh"))
     return digest.hexdigest()[:16]
 
 
@@ -145,19 +147,22 @@ def read_shape(file: Path, up: str) -> Shape:
     Raises:
         InputError: no triangle mesh.
     """
-    try:
-        mesh = trimesh.load(file, force="mesh", process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(f"{file}: expected a mesh, found {error or type(error).__name__}") from None
+    mesh = load_mesh_file(file, "a triangle mesh", trimesh.load_mesh, materials=True)
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{file}: expected a triangle mesh, found one without faces")
     verts = np.asarray(mesh.vertices, dtype=np.float64)
+    check_finite(f"{file}: vertices", verts)
+    check_faces(f"{file}: faces", mesh.faces, len(verts))
     verts = verts - 0.5 * (verts.min(0) + verts.max(0))
-    verts = 0.1 * verts / np.linalg.norm(verts, axis=-1).max()
+    radius = np.linalg.norm(verts, axis=-1).max()
+    if not 0.0 < radius < LARGEST:
+        raise InputError(f"{file}: vertices: expected a mesh with an extent, found a radius of {radius:.3g}")
+    verts = 0.1 * verts / radius
     verts = np.roll(verts, 2 - "xyz".index(up), axis=-1)
     visual: Any = mesh.visual
     if isinstance(visual, trimesh.visual.TextureVisuals):
         visual = visual.to_color()
+        visual.mesh = mesh  # whose vertices it counts where there is no texture
     return Shape(verts, np.asarray(mesh.faces), np.asarray(visual.vertex_colors)[:, :3] / 255.0)
 
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import array_field, flat_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import LONGEST_M, check_solid, read_mesh
 from bigs.data.optics import Optics
@@ -136,7 +136,9 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
     hands_file = view.raw("mano")
     stored = mapping_field(str(hands_file), load_npy(hands_file))
     where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
-    n_rows = len(np.asarray(require(f"{where_hands['right']}.rot", stored.get("right", {}), "rot")))
+    right = mapping_field(where_hands["right"], stored.get("right", {}))
+    where_rows = f"{where_hands['right']}.rot"
+    n_rows = len(array_field(where_rows, require(where_rows, right, "rot"), ("T", 3)))
     rows, offset = _rows(view, frame_names)
     valid = (rows >= 0) & (rows < n_rows)
     if not valid.any():
@@ -287,8 +289,8 @@ def _read_hand(where: str, stored: Any, n_rows: int, rows: np.ndarray, valid: np
         return array_field(f"{where}.{key}", require(f"{where}.{key}", stored, key), shape)
 
     # One shape for all; the documentation shows it repeated in every frame.
-    is_repeated = np.ndim(require(f"{where}.shape", stored, "shape")) == 2
-    betas = field("shape", (n_rows, 10))[0] if is_repeated else field("shape", (10,))
+    shapes = flat_field(f"{where}.shape", require(f"{where}.shape", stored, "shape"))
+    betas = field("shape", (n_rows, 10))[0] if len(shapes) != 10 else shapes
     return HandTrack(
         global_orient=field("rot", (n_rows, 3))[rows],
         hand_pose=field("pose", (n_rows, 45))[rows].reshape(len(rows), 15, 3),
@@ -335,12 +337,12 @@ def _top_vertices(folder: Path, n_verts: int) -> np.ndarray:
     decide where they are given, else the code.
     """
     parts_file, boxes_file = folder / "parts.json", folder / "object_params.json"
-    parts = array_field(str(parts_file), np.asarray(read_json(parts_file)), (n_verts,))
+    parts = array_field(str(parts_file), read_json(parts_file), (n_verts,))
     top = 0
     if boxes_file.is_file() and len(np.unique(parts)) == 2:
         boxes = mapping_field(str(boxes_file), read_json(boxes_file))
         corners = {
-            part: array_field(f"{boxes_file}: bbox_{part}", np.asarray(boxes.get(f"bbox_{part}", [])), (8, 3))
+            part: array_field(f"{boxes_file}: bbox_{part}", boxes.get(f"bbox_{part}", []), (8, 3))
             for part in ("top", "bottom")
         }
         verts, _ = read_mesh(folder / "mesh.obj")

@@ -34,6 +34,14 @@ def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: b
     return array
 
 
+def flat_field(where: str, value: Any, *, finite: bool = True) -> np.ndarray:
+    """`value` as float64 without axes, [N], for fields whose writers disagree about theirs."""
+    array = _numbers(where, value).ravel()
+    if finite:
+        check_finite(where, array)
+    return array
+
+
 def number_field(where: str, value: Any) -> float:
     """`value` as a finite number, alone or in an array; a truth value is none. Else an InputError."""
     array = _numbers(where, value)

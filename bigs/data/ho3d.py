@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_shape
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.fields import flat_field, mapping_field, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import check_solid, read_mesh
 from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
@@ -210,4 +210,6 @@ def _column(
 
 def _numbers(file: Path, meta: Mapping[str, Any], key: str, count: int) -> np.ndarray:
     """A field [count]; rows and columns are the same here, as some frames hold [3, 1] for [3]."""
-    return array_field(f"{file}: {key}", np.ravel(require(f"{file}: {key}", meta, key)), (count,))
+    values = flat_field(f"{file}: {key}", require(f"{file}: {key}", meta, key))
+    check_shape(f"{file}: {key}", values, (count,))
+    return values

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from bigs.checks import InputError, check_faces, check_finite
+from bigs.data.mesh_files import load_mesh_file
 
 # What two hands hold is longer than 2 mm and shorter than 2 m.
 SHORTEST_M, LONGEST_M = 0.002, 2.0
@@ -23,12 +24,7 @@ def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: no such file, it holds no triangles, a vertex is not finite, or a face names none.
     """
-    if not file.is_file():
-        raise InputError(f"{file}: expected a triangle mesh, found no such file")
-    try:
-        mesh = trimesh.load_mesh(file, process=False, maintain_order=True)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(f"{file}: expected a triangle mesh, found {error or type(error).__name__}") from None
+    mesh = load_mesh_file(file, "a triangle mesh", trimesh.load_mesh)
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{file}: expected a triangle mesh, found one without faces")
     verts, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)

@@ -38,6 +38,7 @@ from bigs.data.images import (
     list_frames,
     read_image,
 )
+from bigs.data.mesh_files import load_mesh_file
 from bigs.data.tracks import fill_rotations, fill_vectors
 from bigs.data.transforms import read_cameras
 from bigs.files import read_json
@@ -140,14 +141,9 @@ def _read_transforms(folder: Path, size: tuple[int, int]) -> SfmModel | None:
 
 
 def _read_points(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    if not file.is_file():
-        raise InputError(f"{file}: expected the model's points, found no such file")
-    try:
-        cloud = trimesh.load(file, process=False)
-        points = np.asarray(cloud.vertices, dtype=np.float64)  # type: ignore[attr-defined]
-        colors = np.asarray(getattr(cloud, "colors", np.zeros((0, 4))))
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(f"{file}: expected points, found {error or type(error).__name__}") from None
+    cloud = load_mesh_file(file, "the model's points", trimesh.load)
+    points = array_field(f"{file}: points", getattr(cloud, "vertices", None), ("N", 3))
+    colors = np.asarray(getattr(cloud, "colors", np.zeros((0, 4))))
     return points, colors[:, :3] / 255.0 if len(colors) == len(points) else None
 
 

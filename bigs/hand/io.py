@@ -166,6 +166,9 @@ def _floats(fields: dict[str, Any], key: str, shape: tuple[int | str, ...] | Non
         if shape is not None:
             check_shape(f"{name}, {key}", value, shape)
         value = value.toarray()
+    # Lists may be ragged, or of text; MANO's own fields are arrays.
+    if not isinstance(value, np.ndarray | np.number):
+        raise InputError(f"{name}, {key}: expected an array of numbers, found {type(value).__name__}")
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name}, {key}: expected an array of numbers, found dtype {array.dtype}")

@@ -7,6 +7,7 @@ along its ray.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -16,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bigs.archives import read_npz
-from bigs.checks import InputError
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.checks import InputError, check_shape, shown
+from bigs.data.fields import array_field, flat_field, mapping_field, number_field, require
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.matching import match_count, match_names
 from bigs.types import SIDES, Side
@@ -197,12 +198,13 @@ def _read_fit(
 
 
 def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> dict[Side, Dump]:
-    right = array_field(f"{file}: right", np.ravel(stored["right"]), ("N",)) > 0.5
+    right = flat_field(f"{file}: right", stored["right"]) > 0.5
     count = len(right)
 
     def field(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        raw = np.asarray(require(f"{file}: {key}", stored, key), dtype=np.float64).reshape(count, -1)
-        return array_field(f"{file}: {key}", raw.reshape(count, *shape), (count, *shape))
+        values = flat_field(f"{file}: {key}", require(f"{file}: {key}", stored, key))
+        check_shape(f"{file}: {key}, without axes", values, (count * math.prod(shape),))
+        return values.reshape(count, *shape)
 
     turns = np.concatenate(
         [
@@ -223,17 +225,17 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
         K = hamer_camera(width, height)
     else:
         transl = field("pred_cam_t_full", (3,))
-        focal = float(
-            np.median(array_field(f"{file}: scaled_focal_length", stored.get("scaled_focal_length"), ()))
-        )
+        where = f"{file}: scaled_focal_length"
+        focal = number_field(where, require(where, stored, "scaled_focal_length"))
         K = hamer_camera(width, height)
         K[0, 0] = K[1, 1] = focal
     # HaMeR's own output is the right hand of the mirrored crop; some wrappers turn it back already.
-    if bool(np.all(stored.get("mirrored", "pred_cam" in stored))):
+    mirrored = flat_field(f"{file}: mirrored", stored.get("mirrored", "pred_cam" in stored))
+    if mirrored.all():
         turns[~right] = turns[~right] * mirror[:, None] * mirror
     K = np.diag([frames.width / width, frames.height / height, 1.0]) @ K
     betas = field("betas", (10,))
-    score = np.ravel(np.asarray(stored.get("score", np.ones(count)), dtype=np.float64))
+    score = field("score", ()) if "score" in stored else np.ones(count)
     at = _detection_frames(file, stored, count, frames)
     found: dict[Side, Dump] = {}
     for side in SIDES:
@@ -247,15 +249,14 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
 
 def _as_matrices(file: Path, stored: Mapping[str, Any], key: str, count: int, joints: int) -> np.ndarray:
     """Rotations [N, J, 3, 3] of matrices or axis-angle."""
-    values = np.asarray(require(f"{file}: {key}", stored, key), dtype=np.float64)
+    values = flat_field(f"{file}: {key}", require(f"{file}: {key}", stored, key))
     if values.size == count * joints * 9:
         return values.reshape(count, joints, 3, 3)
     if values.size == count * joints * 3:
         return _matrices(values.reshape(count, joints, 3))
     raise InputError(
         f"{file}: {key}: expected {joints} rotation matrices or axis-angle vectors for each of {count} "
-        f"detections, "
-        f"found shape {list(values.shape)}"
+        f"detections, found {values.size} values"
     )
 
 
@@ -265,19 +266,23 @@ def _matrices(turns: np.ndarray) -> np.ndarray:
 
 def _detection_frames(file: Path, stored: Mapping[str, Any], count: int, frames: FrameSet) -> np.ndarray:
     """The frame [N] of each detection, -1 for one of a picture that was not kept."""
-    listed = np.ravel(require(f"{file}: frame", stored, "frame"))
+    named = require(f"{file}: frame", stored, "frame")
+    # A list of texts stays one: an array would make each as long as the longest.
+    listed = named if isinstance(named, list | tuple) else np.ravel(named).tolist()
     if len(listed) != count:
         raise InputError(f"{file}: frame: expected one for each of {count} detections, found {len(listed)}")
     places: dict[str, int] = {PurePath(name).stem: t for t, name in enumerate(frames.names)}
-    if listed.dtype.kind in "iuf":
+    if not any(isinstance(name, str) for name in listed):
         numbers = frames.source_frames or tuple(range(len(frames.names)))
         places = {str(number): t for t, number in enumerate(numbers)}
-        keys = [str(int(value)) for value in listed]
+        keys = [str(int(value)) for value in flat_field(f"{file}: frame", listed)]
     else:
         keys = [PurePath(str(value)).stem for value in listed]
     at = np.array([places.get(key, -1) for key in keys])
     if (at < 0).all():
-        raise InputError(f"{file}: frame: expected names like {frames.names[0]} or numbers, found {keys[0]}")
+        raise InputError(
+            f"{file}: frame: expected names like {frames.names[0]} or numbers, found {shown(keys[0])}"
+        )
     return at
 
 

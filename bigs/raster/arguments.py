@@ -13,6 +13,8 @@ from bigs.checks import InputError, check_finite
 
 # A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
 _SINGULAR = 1e-9
+# Of all images of a call: 8 GB in single precision. Axes that only repeat can announce any number.
+_MAX_VALUES = 1 << 31
 # What follows from shapes alone is worked out once for each of so many: in a loop they come again and again.
 _REMEMBERED = 64
 
@@ -138,6 +140,14 @@ def _fitted(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> B
     batch = _broadcast(leading)
     if 0 in batch:
         raise InputError(f"batch axes: expected at least one entry, found {list(batch)}")
+    images = math.prod(batch) * cameras
+    # Each pixel has its colours, alpha and depth, each Gaussian in each image a place, depth and extent.
+    for name, each in (("width and height", width * height * (channels + 2)), ("means", 5 * n)):
+        if images * each > _MAX_VALUES:
+            raise InputError(
+                f"{name}: expected at most {_MAX_VALUES} values in all images, found {images * each} "
+                f"({images} images of {width} x {height} pixels, {channels} channels and {n} Gaussians)"
+            )
     return Batch(batch, cameras, width, height, colors_per_camera, sh_degree)
 
 

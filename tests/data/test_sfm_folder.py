@@ -184,7 +184,11 @@ def edit_frames(folder: Path, **changes: object) -> None:
             lambda f: (f / "sparse_pc.ply").unlink(),
             "sparse_pc.ply: expected the model's points",
         ),
-        ("nerfstudio", lambda f: (f / "sparse_pc.ply").write_bytes(b"x"), "sparse_pc.ply: expected points"),
+        (
+            "nerfstudio",
+            lambda f: (f / "sparse_pc.ply").write_bytes(b"x"),
+            "sparse_pc.ply: expected the model's points, found",
+        ),
     ],
 )
 def test_what_is_wrong(

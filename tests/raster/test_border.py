@@ -54,6 +54,28 @@ def test_shapes_are_named(name, shape, words):
         rasterization(**{**scene(), name: torch.zeros(shape, dtype=torch.float64)})
 
 
+@pytest.mark.parametrize("backend", ["rust", "torch"])
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": 1 << 20, "height": 1 << 20}, "width and height: expected at most"),
+        ({"width": 1 << 40, "height": 1}, "width and height: expected at most"),
+        (
+            {
+                "height": 1 << 14,
+                "width": 1 << 14,
+                "colors": torch.zeros(1, 1, dtype=torch.float64).expand(12, 100),
+            },
+            "100 channels",
+        ),
+        ({"means": torch.zeros(1, 1, 3, dtype=torch.float64).expand(1 << 30, 12, 3)}, "expected at most"),
+    ],
+)
+def test_images_that_no_memory_holds(changes, words, backend):
+    with pytest.raises(InputError, match=words):
+        rasterization(**{**scene(), "backgrounds": None, **changes}, backend=backend)
+
+
 def test_batches_that_do_not_broadcast():
     inputs = scene(batch=(2,))
     inputs["quats"] = inputs["quats"].repeat(2, 1, 1)[:3]
