@@ -221,8 +221,9 @@ def render(
 
     shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
     wanted = Wanted(out, video, depth, background_of(background))
-    with telling() as tell:
-        files = render_run(run, shot, wanted, tell)
+    # Shown on a terminal only: a line for each picture would be too many.
+    with stderr.status("starting") as status:
+        files = render_run(run, shot, wanted, status.update)
     rendered = sum(path.parent == out for path in files)
     if out is not None:
         beside = "" if depth is None else f", their depth in {out / 'depth'}"

@@ -193,7 +193,7 @@ def test_cameras_of_two_sizes_make_no_video(finished_run: Run, tmp_path: Path) -
         (["--orbit", "--out", "x", "--world", "object"], ["--world object", "--cameras", "--orbit"]),
         (["--orbit", "--out", "x", "--pictures", "0"], ["--pictures", "1 to 10000", "0"]),
         (["--orbit", "--out", "x", "--size", "0", "5"], ["--size", "positive", "0 5"]),
-        (["--orbit", "--out", "x", "--size", "9999", "9999"], ["--size", "16777216 pixels", "9999 x 9999"]),
+        (["--orbit", "--out", "x", "--size", "9999", "9999"], ["--size", "33177600 pixels", "9999 x 9999"]),
         (["--orbit", "--video", "x.avi"], ["--video", ".mp4", "x.avi"]),
         (["--orbit", "--video", "x.mp4", "--depth", "png"], ["--depth", "--out DIR", "none"]),
         (["--orbit", "--out", "x", "--background", "1,2"], ["--background", "R,G,B", "'1,2'"]),
