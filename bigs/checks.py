@@ -31,6 +31,9 @@ ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
 
 # Of a picture: twice as many as 8K video has. One takes 200 MB as bytes of three colours.
 MAX_PIXELS = 1 << 26
+# Of a mesh in all frames: 1200 frames, as ARCTIC's longest sequence has, of 80 000 vertices. In double
+# precision these take 2.4 GB.
+MAX_MOVED_VERTICES = 100_000_000
 # Rotations are kept in float32 and in print with six digits.
 ROTATION_TOLERANCE = 1e-3
 # How much of a value from a file a message shows.
@@ -111,6 +114,14 @@ def check_pixels(name: str, width: int, height: int, most: int = MAX_PIXELS) -> 
     """Raise `InputError` unless a picture of `width` x `height` has at most `most` pixels."""
     if width * height > most:
         raise InputError(f"{name}: expected at most {most} pixels, found {width} x {height}")
+
+
+def check_product(name: str, frames: int, verts: int, most: int = MAX_MOVED_VERTICES) -> None:
+    """Raise `InputError` unless a mesh of `verts` vertices can be kept in each of `frames` frames."""
+    if frames * verts > most:
+        raise InputError(
+            f"{name}: expected at most {most} vertices in all frames, found {frames} frames of {verts}"
+        )
 
 
 def shown(value: Any) -> str:

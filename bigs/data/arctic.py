@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_pixels, check_product
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import array_field, flat_field, mapping_field, require
@@ -132,7 +132,7 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
         InputError: a missing or damaged file or field, a name that is no number, or no annotated frame.
     """
     where, meta = _subject_meta(view)
-    sizes = _image_sizes(where, meta)
+    width, height = _image_size(where, meta, view.view)
     hands_file = view.raw("mano")
     stored = mapping_field(str(hands_file), load_npy(hands_file))
     where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
@@ -148,7 +148,6 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
         )
     rows = np.clip(rows, 0, n_rows - 1)
     K, cam_from_world = _camera(view, where, meta, rows)
-    width, height = (int(value) for value in sizes[view.view])
     return Annotation(
         name=check_name(f"{view.root}: sequence", view.name),
         frame_names=tuple(frame_names),
@@ -189,12 +188,18 @@ def camera_of_images(folder: Path) -> tuple[np.ndarray, tuple[int, int]] | None:
         return None
     subject, sequence, view = folder.absolute().parts[-3:]
     where, meta = _subject_meta(ArcticView(file.parent.parent, subject, sequence, int(view)))
-    width, height = _image_sizes(where, meta)[int(view)]
-    return _intrinsics(where, meta)[int(view) - 1], (int(width), int(height))
+    return _intrinsics(where, meta)[int(view) - 1], _image_size(where, meta, int(view))
 
 
-def _image_sizes(where: str, meta: Mapping[str, Any]) -> np.ndarray:
-    return array_field(f"{where}.image_size", require(f"{where}.image_size", meta, "image_size"), (9, 2))
+def _image_size(where: str, meta: Mapping[str, Any], view: int) -> tuple[int, int]:
+    """Width and height of a view's whole pictures."""
+    where = f"{where}.image_size"
+    size = array_field(where, require(where, meta, "image_size"), (9, 2))[view]
+    if size.min() < 1 or (size != np.floor(size)).any():
+        raise InputError(f"{where}: expected widths and heights in pixels, found {size.tolist()}")
+    width, height = map(int, size)
+    check_pixels(where, width, height)
+    return width, height
 
 
 def _intrinsics(where: str, meta: Mapping[str, Any]) -> np.ndarray:
@@ -310,6 +315,7 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     if np.ptp(verts, axis=0).max() > LONGEST_M:
         verts = verts / MM_PER_M
     check_solid(str(folder / "mesh.obj"), verts, faces)
+    check_product(str(folder / "mesh.obj"), len(rows), len(verts))
     file = view.raw("object")
     poses = array_field(str(file), load_npy(file), (n_rows, 7))[rows]
     check_turns(str(file), poses[:, 1:4], valid)

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from bigs.archives import read_npz
-from bigs.checks import InputError, check_faces, check_rotations
+from bigs.checks import InputError, check_faces, check_pixels, check_product, check_rotations
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack
 from bigs.data.fields import array_field, number_field, require
@@ -94,7 +94,8 @@ def load_annotation(path: str | Path) -> Annotation:
     size = _field(file, arrays, "wh", (2,))
     if size.min() < 1 or (size != np.floor(size)).any():
         raise InputError(f"{file}: wh: expected a width and a height in pixels, found {size.tolist()}")
-    width, height = size.astype(int)
+    width, height = map(int, size)
+    check_pixels(f"{file}: wh", width, height)
     hands: dict[Side, HandTrack] = {}
     frames: int | str = "T"
     for side in SIDES:
@@ -113,14 +114,15 @@ def load_annotation(path: str | Path) -> Annotation:
         rotations, transl, scale = _object_poses(file, arrays, frames)
         frames = len(rotations)
         verts, faces = _read_mesh(file, scale)
+        check_product(f"{file}: {OBJECT_FILE}", frames, len(verts))
         obj = ObjectTruth(verts, faces, rotations, transl, np.ones(frames, dtype=bool))
     if not isinstance(frames, int) or not frames:
         raise InputError(f"{file}: expected right_pose, left_pose or obj_R, found {', '.join(arrays)}")
     return Annotation(
         name=file.resolve().parent.name,
         frame_names=_frame_names(file, frames),
-        width=int(width),
-        height=int(height),
+        width=width,
+        height=height,
         K=K,
         cam_from_world=np.repeat(np.eye(4)[None], frames, axis=0),
         hands=hands,
@@ -164,6 +166,7 @@ def _read_mesh(file: Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
 def _read_object(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> tuple[np.ndarray, np.ndarray]:
     rotations, transl, scale = _object_poses(file, arrays, frames)
     own, faces = _read_mesh(file, scale)
+    check_product(f"{file}: {OBJECT_FILE}", len(rotations), len(own))
     return np.einsum("tij,nj->tni", rotations, own) + transl[:, None], faces
 
 

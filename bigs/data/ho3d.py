@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.checks import InputError, check_shape
+from bigs.checks import InputError, check_product, check_shape
 from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
 from bigs.data.fields import flat_field, mapping_field, require
@@ -186,6 +186,7 @@ def _read_object(
         return None
     verts, faces = read_mesh(model)
     check_solid(str(model), verts, faces)
+    check_product(str(model), len(files), len(verts))
     stored = _column(files, metas, "objRot", 3, valid)
     check_turns(f"{clip.folder / 'meta'}: objRot", stored, valid)
     rotvecs = fill_rotations(stored[:, None], valid)[:, 0]

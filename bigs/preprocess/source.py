@@ -4,17 +4,34 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, ImageOps
 
-from bigs.checks import InputError, found_at
+from bigs.checks import InputError, check_pixels, found_at
 from bigs.data.images import open_picture
+from bigs.files import open_regular
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+# FFmpeg's names of these kinds, and how they begin.
+_CONTAINERS = {
+    "mov": re.compile(rb".{4}(?:ftyp|moov|mdat|wide|free|skip|pnot)", re.DOTALL),
+    "matroska": re.compile(rb"\x1a\x45\xdf\xa3"),
+    "avi": re.compile(rb"RIFF.{4}AVI ", re.DOTALL),
+    "gif": re.compile(rb"GIF8[79]a"),
+    "mpeg": re.compile(rb"\x00\x00\x01\xba"),
+    "mpegvideo": re.compile(rb"\x00\x00\x01\xb3"),
+}
+_HEAD_BYTES = 16
+# A film that names others as its tracks would have them opened.
+_OPTIONS = {"mov": {"enable_drefs": "0", "use_absolute_path": "0"}}
+# An hour at 240 frames a second; a clip has hundreds.
+_MAX_FRAMES = 864_000
 # Folders of images say nothing of time.
 FOLDER_FPS = 30.0
 
@@ -47,10 +64,13 @@ class Source:
         av = _import_av(self.path)
         index = 0
         try:
-            with av.open(str(self.path)) as container:
+            with _open_video(av, self.path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 for frame in container.decode(stream):
+                    check_pixels(f"{self.path}: frame {index}", frame.width, frame.height)
+                    if index >= _MAX_FRAMES:
+                        raise InputError(f"{self.path}: expected at most {_MAX_FRAMES} frames, found more")
                     pixels = frame.to_ndarray(format="rgb24")
                     # The flag says how far to turn the picture counter-clockwise to set it upright.
                     yield (
@@ -78,18 +98,38 @@ def open_source(path: Path) -> Source:
             )
         images = tuple(sorted(files, key=natural_order))
         return Source(path, FOLDER_FPS, exif=_exif(images[0]), images=images)
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{path}: expected a video file or a folder of images, found {found_at(path)}")
     av = _import_av(path)
     try:
-        with av.open(str(path)) as container:
+        with _open_video(av, path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: expected a video, found a file without pictures")
             stream = container.streams.video[0]
+            check_pixels(str(path), stream.width, stream.height)
             rate = stream.average_rate or stream.guessed_rate
             return Source(path, float(rate) if rate else FOLDER_FPS, tags=dict(container.metadata))
     except av.FFmpegError as error:
         raise InputError(f"{path}: expected a readable video, found {error.strerror or error}") from None
+
+
+@contextmanager
+def _open_video(av: Any, path: Path) -> Iterator[Any]:
+    """A video's container, of one of the usual kinds: FFmpeg would follow a playlist to wherever it leads.
+
+    Raises:
+        InputError: no regular file, or another kind; and what FFmpeg raises.
+    """
+    with open_regular(path, "a video") as file:
+        head = file.read(_HEAD_BYTES)
+        kind = next((kind for kind, begins in _CONTAINERS.items() if begins.match(head)), None)
+        if kind is None:
+            raise InputError(
+                f"{path}: expected a readable video ({', '.join(VIDEO_SUFFIXES)}), found none by its content"
+            )
+        file.seek(0)
+        with av.open(file, format=kind, options=_OPTIONS.get(kind, {})) as container:
+            yield container
 
 
 def is_source(path: Path) -> bool:
