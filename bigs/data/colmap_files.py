@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bigs.checks import InputError
-from bigs.files import read_bytes
+from bigs.files import check_regular, read_bytes
 
 # Parameters of the camera models, by number, as COLMAP's documentation lists them.
 _PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
+# A model of a thousand frames has 30 MB.
+_MAX_BYTES = 1 << 30
 # Longer names no file system has.
 _LONGEST_NAME = 4096
 
@@ -48,27 +50,45 @@ class _Reader(NamedTuple):
         track = at + 8 + 3 * 8 + 3 + 8
         return track + 8 + 8 * self.number(track, "Q")
 
+    def rig(self, at: int) -> int:
+        sensors, at = self.number(at + 4, "I"), at + 8
+        # The first is the one that the others' poses refer to; each of them may have a pose.
+        for index in range(sensors):
+            at += 8 if index == 0 else 9 + 56 * bool(self.number(at + 8, "B"))
+        return at
+
+    def frame(self, at: int) -> int:
+        return at + 68 + 16 * self.number(at + 64, "I")
+
 
 _ENTRIES: dict[str, Callable[[_Reader, int], int]] = {
     "cameras": _Reader.camera,
     "images": _Reader.image,
     "points3D": _Reader.point,
+    # Since version 3.12.
+    "rigs": _Reader.rig,
+    "frames": _Reader.frame,
 }
+_REQUIRED = ("cameras", "images", "points3D")
 
 
 def check_model_files(place: Path) -> None:
     """Refuse a binary model of which a file is cut off, or goes on after its last entry.
 
     Raises:
-        InputError: such a file, or one that is missing; a model in text has nothing to be walked.
+        InputError: such a file, one that is no regular file, or one that is missing; a model in text has
+            nothing to be walked.
     """
     for name, entry in _ENTRIES.items():
-        file = place / f"{name}.bin"
-        if not file.is_file():
-            if not (place / f"{name}.txt").is_file():
+        file, text = place / f"{name}.bin", place / f"{name}.txt"
+        for found in (file, text):
+            if found.exists():
+                check_regular(found, "a file of a COLMAP model", _MAX_BYTES)
+        if not file.exists():
+            if name in _REQUIRED and not text.exists():
                 raise InputError(f"{file}: expected a file of a COLMAP model, found none")
             continue
-        reader, at, read = _Reader(read_bytes(file, "a COLMAP model")), 8, 0
+        reader, at, read = _Reader(read_bytes(file, "a file of a COLMAP model")), 8, 0
         try:
             count = reader.number(0, "Q")
             while read < count:
