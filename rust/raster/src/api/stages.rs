@@ -186,7 +186,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
         Ok(grads)
     }
 
-    /// How many (pixel, Gaussian) pairs the image is made of: alpha reaches the threshold, and the pixel is not spent.
+    /// How many (pixel, Gaussian) pairs the image is made of: alpha reaches the threshold, and the pixel has not stopped.
     pub fn pairs(&self) -> usize {
         let limits = &self.limits;
         let (threshold, most, stop) = (

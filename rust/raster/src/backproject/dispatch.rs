@@ -9,13 +9,13 @@ use crate::project::packet::{PacketGradients, packet_vjp};
 use crate::project::splat::Projection;
 use crate::simd::level::{Simd, SimdLevel, Work};
 
-struct Gather<'a, T> {
+struct SumPacket<'a, T> {
     from: &'a PacketIntersections<'a, T>,
     out: ScreenGradients<'a, T>,
     v: &'a mut PacketGradients<T>,
 }
 
-impl<T: Real> Work for Gather<'_, T> {
+impl<T: Real> Work for SumPacket<'_, T> {
     type Output = ();
 
     #[inline(always)]
@@ -41,13 +41,13 @@ impl<T: Real, const ANTIALIASED: bool, const CAMERA: bool> Work for Vjp<'_, T, A
 }
 
 /// [`sum_packet`] at this level.
-pub(crate) fn gather<T: Real>(
+pub(crate) fn sum<T: Real>(
     level: SimdLevel,
     from: &PacketIntersections<'_, T>,
     out: ScreenGradients<'_, T>,
     v: &mut PacketGradients<T>,
 ) {
-    level.run(Gather { from, out, v });
+    level.run(SumPacket { from, out, v });
 }
 
 /// [`packet_vjp`] at this level; the camera's part only if asked for.

@@ -95,7 +95,7 @@ pub(crate) fn project_view_vjp<T: Real>(
                     detach_means2d: out.detach_means2d,
                 };
                 v.clear();
-                dispatch::gather(level, &from, screen, v);
+                dispatch::sum(level, &from, screen, v);
                 if geometry && v.len > 0 {
                     dispatch::vjp(level, gaussians, first, &projection, want_camera, v);
                     v.add_to(means, quats, scales, opacities);
