@@ -47,9 +47,20 @@ class RayPositions(nn.Module):
         depth = self.base_log_depth[frames].exp()[:, None]
         return torch.cat([self.base_ray[frames] * depth, depth], dim=-1)
 
-    def forward(self, frames: Tensor, start: Tensor | None = None, freedom: Tensor | None = None) -> Tensor:
-        """Positions [B, 3] of `frames` [B]; for `start` and `freedom` [B] see `HandPoses.forward`."""
+    def forward(
+        self,
+        frames: Tensor,
+        start: Tensor | None = None,
+        freedom: Tensor | None = None,
+        ray_freedom: Tensor | None = None,
+    ) -> Tensor:
+        """Positions [B, 3] of `frames` [B]; for `start` and `freedom` [B] see `HandPoses.forward`.
+
+        `ray_freedom` [B] does the same for the rays alone.
+        """
         ray, log_depth = self.ray[frames], self.log_depth[frames]
+        if ray_freedom is not None:
+            ray = ray_freedom[:, None] * ray
         if freedom is not None:
             ray, log_depth = freedom[:, None] * ray, freedom * log_depth
         if start is None:
@@ -123,26 +134,62 @@ class HandPoses(nn.Module):
         self.position.restart(poses.wrist)
 
 
+class PoseErrors(NamedTuple):
+    """How far an object's start poses are off, one standard deviation, by frame."""
+
+    turn: Tensor  # [T, 3, 3] a square root of the turns' covariance, radians, camera axes
+    ray: Tensor  # [T] of the place on the z = 1 plane
+
+
+# How far an estimate that nobody measured may be off: learning rates were chosen for it.
+USUAL_TURN = 0.025  # radians
+USUAL_RAY = 0.006
+
+
 class ObjectPoses(nn.Module):
     """The object's poses over a clip and its size.
 
     One logarithmic scale multiplies size *and* depth, so that changing it leaves the projection alone: that
     is the one quantity a single camera cannot see.
+
+    Residuals of turn and ray count in usual errors of an estimate. Where the start is known better they are
+    scaled down alike, so that one learning rate and one prior suit frames of all kinds.
     """
 
-    def __init__(self, rotations: Tensor, centers: Tensor) -> None:
-        """Starts: rotations [T, 3, 3] and positions [T, 3] (metres) of the canonical origin."""
+    def __init__(self, rotations: Tensor, centers: Tensor, errors: PoseErrors | None = None) -> None:
+        """Starts: rotations [T, 3, 3] and positions [T, 3] (metres) of the canonical origin.
+
+        `errors` tell how well they are known; without them all frames are as uncertain as usual.
+        """
         super().__init__()
+        frames = rotations.shape[0]
         self.register_buffer("base_orient", rotations)
-        self.orient = nn.Parameter(torch.zeros(rotations.shape[0], 3))
+        self.orient = nn.Parameter(torch.zeros(frames, 3))
         self.position = RayPositions(centers)
         self.log_scale = nn.Parameter(torch.zeros(()))
+        turn, ray = torch.eye(3).repeat(frames, 1, 1), torch.ones(frames)
+        if errors is not None:
+            size = torch.linalg.matrix_norm(errors.turn, ord=2)[:, None, None]
+            turn = errors.turn / size.clamp_min(USUAL_TURN)
+            ray = (errors.ray / USUAL_RAY).clamp(max=1.0)
+        # What residuals are multiplied by: never more than 1.
+        self.register_buffer("turn_freedom", turn)
+        self.register_buffer("ray_freedom", ray)
+        # Whether the start was measured, so that a prior holds its rays, too.
+        self.register_buffer("measured", torch.tensor(float(errors is not None)))
 
     def forward(self, frames: Tensor) -> ObjectFrames:
         """The poses of `frames` [B]."""
         scale = self.log_scale.exp()
+        turn = (self.turn_freedom[frames] @ self.orient[frames][..., None])[..., 0]
         return ObjectFrames(
-            axis_angle_to_matrix(self.orient[frames]) @ self.base_orient[frames],
-            scale * self.position(frames),
+            axis_angle_to_matrix(turn) @ self.base_orient[frames],
+            scale * self.position(frames, ray_freedom=self.ray_freedom[frames]),
             scale,
         )
+
+    def departures(self) -> Tensor:
+        """Residuals [T, 3] or, where the start was measured, [T, 5], in radians of a usual error."""
+        if not self.measured:
+            return self.orient
+        return torch.cat([self.orient, USUAL_TURN / USUAL_RAY * self.position.ray], dim=1)

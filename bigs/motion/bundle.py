@@ -25,6 +25,8 @@ class BundleConfig:
     pixel_sigma: float = 0.25  # of a reprojection error, pixels
     turn_sigma: float = 0.3  # of the change of angular velocity, degrees a frame and frame
     shift_sigma: float = 0.0015  # of the change of velocity, in depths a frame and frame
+    # Poses that were known before lose weight from so many standard deviations on.
+    anchor_outlier: float = 3.0
     iterations: int = 15
     # Stop when a step lowers the cost by less than this share of it.
     tolerance: float = 1e-4
@@ -49,7 +51,24 @@ class Bundle(NamedTuple):
         return _in_camera(self)[:, 2]
 
 
-def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndarray | None = None) -> Bundle:
+class Anchor(NamedTuple):
+    """Poses that were known before, and how well; they hold what the sightings leave open, the gauge too."""
+
+    rotations: np.ndarray  # [T, 3, 3] object to camera
+    transl: np.ndarray  # [T, 3]
+    trust: np.ndarray  # [T] in [0, 1]; a frame of 0 has none
+    turn_sigma: float  # radians, about each axis
+    shift_sigma: np.ndarray  # [3] by the camera's axes
+
+
+def adjust(
+    bundle: Bundle,
+    K: np.ndarray,
+    config: BundleConfig,
+    *,
+    free: np.ndarray | None = None,
+    anchor: Anchor | None = None,
+) -> Bundle:
     """Minimise reprojection errors under the motion prior.
 
     Args:
@@ -57,19 +76,21 @@ def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndar
         K: [3, 3] intrinsics.
         config: see there.
         free: [T] bool, frames whose pose may change; all by default.
+        anchor: poses known before, by Geman-McClure's loss.
 
     Returns:
-        The adjusted bundle; its gauge (pose and size of the object frame) is free to drift a little.
+        The adjusted bundle; without an anchor its gauge (pose and size of the object frame) is free to drift
+        a little.
     """
     free = np.ones(len(bundle.rotations), dtype=bool) if free is None else free
-    problem = _Problem(sort_sightings(bundle.frame, bundle.point, bundle.pixels, free), free, K, config)
+    problem = _problem(bundle, K, config, free, anchor)
     damping = 1e-3
-    cost = _cost(bundle, K, config)
+    cost = _cost(problem, bundle)
     for _ in range(config.iterations):
         system = _linearise(problem, bundle)
         for _ in range(6):
             candidate = _step(problem, bundle, system, damping)
-            new_cost = _cost(candidate, K, config)
+            new_cost = _cost(problem, candidate)
             if new_cost < cost:
                 break
             damping *= 8.0
@@ -81,13 +102,36 @@ def adjust(bundle: Bundle, K: np.ndarray, config: BundleConfig, *, free: np.ndar
     return bundle
 
 
+def pose_covariances(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor: Anchor) -> np.ndarray:
+    """Covariance [T, 6, 6] of each frame's turn (radians) and shift (the unit of `transl`).
+
+    To first order, from sightings, motion prior and anchor. A turn, shift or growth of the object's frame
+    itself has no part in it: it changes all poses alike and leaves the pictures alone.
+    """
+    frames = len(bundle.rotations)
+    problem = _problem(bundle, K, config, np.ones(frames, dtype=bool), anchor)
+    matrix = reduce(_linearise(problem, bundle), problem.seen, 0.0).matrix
+    covariance = np.linalg.inv(matrix)
+    # What the gauge may do to all poses: seven columns. Frames that are known well say where it is.
+    gauge = np.zeros((frames, 6, 7))
+    gauge[:, :3, :3] = bundle.rotations
+    gauge[:, 3:, 3:6] = bundle.rotations
+    gauge[:, 3:, 6] = bundle.transl
+    columns = gauge.reshape(6 * frames, 7)
+    weighted = columns / np.diag(covariance)[:, None]
+    off = columns @ np.linalg.solve(columns.T @ weighted, weighted.T)
+    rest = np.eye(6 * frames) - off
+    blocks = (rest @ covariance @ rest.T).reshape(frames, 6, frames, 6)
+    return np.einsum("titj->tij", blocks)
+
+
 def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> np.ndarray:
     """Standard deviation of each frame's rotation against that of every other, [T, T] degrees.
 
     To first order, for independent reprojection errors of `config.pixel_sigma`. The gauge has no part in it.
     """
     free = np.ones(len(bundle.rotations), dtype=bool)
-    problem = _Problem(sort_sightings(bundle.frame, bundle.point, bundle.pixels, free), free, K, config)
+    problem = _problem(bundle, K, config, free, None)
     reduced = reduce(_linearise(problem, bundle), problem.seen, 0.0)
     covariance = np.linalg.pinv(reduced.matrix, rcond=1e-10, hermitian=True)
     blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
@@ -105,6 +149,14 @@ class _Problem(NamedTuple):
     free: np.ndarray  # [T] bool, frames whose pose may change
     K: np.ndarray
     config: BundleConfig
+    anchor: Anchor | None
+
+
+def _problem(
+    bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray, anchor: Anchor | None
+) -> _Problem:
+    seen = sort_sightings(bundle.frame, bundle.point, bundle.pixels, free)
+    return _Problem(seen, free, K, config, anchor)
 
 
 def _in_camera(bundle: Bundle) -> np.ndarray:
@@ -128,10 +180,27 @@ def _soft(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 2.0 * (root - 1.0), 1.0 / root
 
 
-def _cost(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> float:
-    pixel, _ = _cauchy((bundle.residuals(K) ** 2).sum(1) / config.pixel_sigma**2)
+def _leaving(squared: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same for Geman-McClure's loss: what is off by many times `scale` pulls no more."""
+    share = 1.0 / (1.0 + squared / scale**2)
+    return squared * share, share**2
+
+
+def _cost(problem: _Problem, bundle: Bundle) -> float:
+    config = problem.config
+    pixel, _ = _cauchy((bundle.residuals(problem.K) ** 2).sum(1) / config.pixel_sigma**2)
     turn, shift = _accelerations(bundle, config)
-    return float(pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum())
+    total = pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
+    if problem.anchor is not None:
+        for values in _departures(bundle, problem.anchor):
+            total += problem.anchor.trust @ _leaving((values**2).sum(1), config.anchor_outlier)[0]
+    return float(total)
+
+
+def _departures(bundle: Bundle, anchor: Anchor) -> tuple[np.ndarray, np.ndarray]:
+    """Turns and shifts [T, 3] from the anchor's poses, in units of their scales."""
+    turn = Rotation.from_matrix(bundle.rotations @ anchor.rotations.transpose(0, 2, 1)).as_rotvec()
+    return turn / anchor.turn_sigma, (bundle.transl - anchor.transl) / anchor.shift_sigma
 
 
 def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -159,6 +228,8 @@ def _linearise(problem: _Problem, bundle: Bundle) -> System:
     )
     poses, gradient = system.poses.reshape(frames, 6, frames, 6), system.pose_gradient.reshape(frames, 6)
     _add_prior(poses, gradient, bundle, problem)
+    if problem.anchor is not None:
+        _add_anchor(poses, gradient, bundle, problem, problem.anchor)
     return system
 
 
@@ -179,6 +250,20 @@ def _add_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem:
                 both = here & free[first + j]
                 a, b = slot[first + i][both][:, None], slot[first + j][both][:, None]
                 poses[a, columns, b, columns] += weights[both] * own * other * scale**2
+
+
+def _add_anchor(
+    poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem, anchor: Anchor
+) -> None:
+    """Add the anchor's part in place."""
+    free = problem.free
+    slot = np.arange(int(free.sum()))[:, None]
+    scales = (np.full(3, 1.0 / anchor.turn_sigma), 1.0 / anchor.shift_sigma)
+    for part, (values, scale) in enumerate(zip(_departures(bundle, anchor), scales, strict=True)):
+        columns = np.arange(3 * part, 3 * part + 3)
+        weights = anchor.trust * _leaving((values**2).sum(1), problem.config.anchor_outlier)[1]
+        gradient[slot, columns] += (weights[:, None] * scale * values)[free]
+        poses[slot, columns, slot, columns] += (weights[:, None] * scale**2)[free]
 
 
 # Coefficients of a second difference.

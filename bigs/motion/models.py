@@ -108,6 +108,37 @@ def map_features(
     return Mapping([models[i] for i in order], matches, focal)
 
 
+def match_features(
+    features: Sequence[FrameFeatures],
+    K: np.ndarray,
+    size: tuple[int, int],
+    pairs: Sequence[tuple[int, int]],
+    config: MappingConfig,
+) -> dict[tuple[int, int], np.ndarray]:
+    """Verified matches [n, 2] of `pairs` of frames, the earlier first; arguments as for `map_features`."""
+    with tempfile.TemporaryDirectory(prefix="bigs-sfm-") as folder, quiet_colmap():
+        file = Path(folder) / "clip.db"
+        _write_database(file, features, K, size, True, True)
+        names = Path(folder) / "pairs.txt"
+        names.write_text("".join(f"{a:06d}.png {b:06d}.png\n" for a, b in pairs))
+        pycolmap.match_image_pairs(
+            file,
+            matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=names),
+            verification_options=_verification(config),
+            device=pycolmap.Device.cpu,
+        )
+        return _verified_matches(file)
+
+
+def _verification(config: MappingConfig) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = config.pair_inliers
+    options.ransac.max_error = config.match_error
+    options.ransac.random_seed = config.seed
+    return options
+
+
 def _write_database(
     file: Path,
     features: Sequence[FrameFeatures],
@@ -153,10 +184,7 @@ def frame_pairs(frames: int, config: MappingConfig) -> list[tuple[int, int]]:
 
 
 def _match(file: Path, config: MappingConfig, candidates: dict[tuple[int, int], np.ndarray] | None) -> None:
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = config.pair_inliers
-    verification.ransac.max_error = config.match_error
-    verification.ransac.random_seed = config.seed
+    verification = _verification(config)
     if candidates is not None:
         _verify(file, candidates, verification)
         return

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.spatial
 
-from bigs.motion.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust
 from bigs.motion.features import FrameFeatures
 from bigs.motion.tracks import Tracks
 
@@ -40,6 +40,8 @@ class ObjectMap:
     ) -> None:
         """A map without poses and points; `tracks` hold the sightings of `features`, one entry per frame."""
         self.features, self.K, self.config = features, K, config
+        # Poses known before, of all frames; None where the pictures are all there is.
+        self.anchor: Anchor | None = None
         frames = len(features)
         self.rotations = np.tile(np.eye(3), (frames, 1, 1))  # [T, 3, 3] object to camera
         self.transl = np.zeros((frames, 3))
@@ -61,11 +63,14 @@ class ObjectMap:
         self.known[:] = False
         self.triangulate()
 
-    def settle(self) -> None:
-        """Bundle adjustment of all posed frames (which must be consecutive), from coarse to fine."""
+    def settle(self, reaches: Sequence[float] = (3.0, 1.0)) -> None:
+        """Bundle adjustment of all posed frames (which must be consecutive), from coarse to fine.
+
+        `reaches` are factors on what the configuration says of pixels, one round each.
+        """
         frames = np.flatnonzero(self.posed)
         config = self.config
-        for reach in (3.0, 1.0):
+        for reach in reaches:
             self.config = replace(
                 config,
                 keep_error=reach * config.keep_error,
@@ -190,9 +195,13 @@ class ObjectMap:
     def adjust(self, frames: np.ndarray, free: np.ndarray, config: BundleConfig) -> None:
         """Bundle adjustment of consecutive `frames` [F], of which `free` [F] (bool) may move."""
         bundle, tracks = self.bundle(frames)
-        if len(tracks) == 0:
+        if len(tracks) == 0 and self.anchor is None:
             return
-        bundle = adjust(bundle, self.K, config, free=free)
+        anchor = self.anchor
+        if anchor is not None:
+            rotations, transl, trust = (values[frames] for values in anchor[:3])
+            anchor = anchor._replace(rotations=rotations, transl=transl, trust=trust)
+        bundle = adjust(bundle, self.K, config, free=free, anchor=anchor)
         self.rotations[frames], self.transl[frames] = bundle.rotations, bundle.transl
         self.points[tracks] = bundle.points
 

@@ -15,13 +15,13 @@ from bigs.motion.grow import GrowConfig, grow
 from bigs.motion.models import Mapping, MappingConfig, frame_pairs, map_features
 from bigs.motion.object_map import MapConfig, ObjectMap
 from bigs.motion.patches import PatchConfig, Pictures, sharpen
+from bigs.motion.points import color_points, normalisation, trim_points
 from bigs.motion.refine import RefineConfig, refine
 from bigs.motion.seed import Seed, find_seed
 from bigs.motion.tracks import Tracks, join_matches
 from bigs.preprocess.artefacts import ObjectSfm
 from bigs.preprocess.sfm_checks import CheckConfig, SfmChecks, check_map
 from bigs.preprocess.sfm_learned import LearnedMatcher, extract_learned, match_learned
-from bigs.preprocess.sfm_points import color_points, normalisation, trim_points
 from bigs.preprocess.words import frame_ranges
 from bigs.types import MASK_VALUES
 

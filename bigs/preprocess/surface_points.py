@@ -15,9 +15,9 @@ import trimesh
 
 from bigs.geometry.coverage import ObjectViews, seen_in, times_seen
 from bigs.geometry.surface import DistanceGrid, extract_mesh, inlier_points, neighbour_distances
+from bigs.motion.points import normalisation
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
 from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
-from bigs.preprocess.sfm_points import normalisation
 from bigs.types import MASK_VALUES
 
 

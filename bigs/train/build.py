@@ -22,6 +22,7 @@ from bigs.models.lighting import Lighting
 from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
+from bigs.motion.tracker import TrackedMotion
 from bigs.train.carving import carve, convex_surface
 from bigs.train.completion import CompletionConfig, complete
 from bigs.train.initial import (
@@ -32,6 +33,7 @@ from bigs.train.initial import (
     smooth_hand,
     smooth_object,
 )
+from bigs.train.object_motion import pose_errors, with_motion
 from bigs.types import Side
 
 
@@ -65,6 +67,7 @@ def build_scene(
     obj: ObjectSplatsConfig,
     lighting: bool,
     completion: CompletionConfig | None = None,
+    motion: TrackedMotion | None = None,
 ) -> SceneStart:
     """A scene at its start values.
 
@@ -76,6 +79,7 @@ def build_scene(
         lighting: whether colours depend on the direction a surface faces.
         completion: where much of the object was never seen, its symmetries are looked for; if it has none,
             hands meet nothing there. Otherwise, and without it, they meet the closed surface.
+        motion: of the object, if tracks were asked; it takes the place of the smoothed estimates.
     """
     starts = {
         side: smooth_hand(
@@ -89,14 +93,19 @@ def build_scene(
     known = None
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
-        start = smooth_object(object_in_camera(clip, initial), initial.smooth_object)
+        start = object_in_camera(clip, initial)
+        errors = None if motion is None else pose_errors(motion)
+        if motion is None:
+            start = smooth_object(start, initial.smooth_object)
+        else:
+            start = with_motion(start, motion)
         surfaces = _object_surfaces(clip, unknown, start, initial, completion)
         skipped, symmetries, known = surfaces.skipped, surfaces.symmetries, surfaces.known
         verts, faces = surfaces.closed
         points, normals = sample_surface(verts, faces, obj.n_gaussians)
         object_parts = {
             "object_splats": ObjectSplats(points, normals, _nearest_colors(points, start), obj),
-            "object_poses": ObjectPoses(start.rotations, start.centers),
+            "object_poses": ObjectPoses(start.rotations, start.centers, errors),
             "object_surface": _as_surface(verts, faces),
             "object_distance": DistanceField(surfaces.solid),
         }

@@ -7,6 +7,7 @@ from typing import Literal
 
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
+from bigs.motion.tracker import TrackerConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.completion import CompletionConfig
 from bigs.train.density import DensifyConfig
@@ -91,6 +92,18 @@ class GraspStage:
 
 
 @dataclass(frozen=True)
+class ObjectMotionStage:
+    """The object's motion from tracks in its pictures, found before anything is built on it.
+
+    See `motion.tracker`. It is the first stage of a plan that has it.
+    """
+
+    name: str = "object-motion"
+    step: Step = "single-subject"
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+
+
+@dataclass(frozen=True)
 class SplitStage:
     """Fields are evaluated a last time, and Gaussians go on without them (see `models.free_gaussians`)."""
 
@@ -172,7 +185,15 @@ class GuidanceStage:
     unlike: float = 1.2
 
 
-Stage = OptimizeStage | ScaleSearchStage | GraspStage | SplitStage | CompletionStage | GuidanceStage
+Stage = (
+    OptimizeStage
+    | ObjectMotionStage
+    | ScaleSearchStage
+    | GraspStage
+    | SplitStage
+    | CompletionStage
+    | GuidanceStage
+)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
+from bigs.motion.tracker import TrackedMotion
 from bigs.train.background import unknown_occluders
 from bigs.train.build import build_scene
 from bigs.train.checkpoint import load_checkpoint, save_checkpoint
@@ -26,6 +27,7 @@ from bigs.train.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    ObjectMotionStage,
     OptimizeStage,
     RunConfig,
     ScaleSearchStage,
@@ -35,6 +37,7 @@ from bigs.train.config import (
 from bigs.train.evidence import EvidenceSource
 from bigs.train.grasps import find_grasps
 from bigs.train.loop import StageProgress, StageState, run_stage
+from bigs.train.object_motion import find_object_motion, in_words
 from bigs.train.prior_stages import run_completion, run_guidance, without_missing_prior
 from bigs.train.scale_search import search_object_scale
 from bigs.train.stopwatch import Stopwatch
@@ -94,6 +97,10 @@ def fit(
     watch = watch or Stopwatch("start values")
     watch.begin("start values")
     unknown = unknown_occluders(clip)
+    motion = None
+    if isinstance(config.stages[0], ObjectMotionStage):
+        motion = _object_motion(clip, config, config.stages[0], checkpoints, report, listen)
+        began = time.perf_counter()
     start = build_scene(
         clip,
         unknown,
@@ -103,6 +110,7 @@ def fit(
         config.object,
         config.lighting,
         config.prior.completion if any(isinstance(s, CompletionStage) for s in config.stages) else None,
+        motion,
     )
     scene = start.scene
     gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
@@ -128,7 +136,7 @@ def fit(
             save_checkpoint(checkpoints, scene, digest, index, state, asdict(report))
 
     for index, stage in enumerate(config.stages):
-        if index < first:
+        if index < first or isinstance(stage, ObjectMotionStage):
             continue
         why = _not_needed(stage, scene)
         if isinstance(stage, GuidanceStage) and "object completed" in report.facts:
@@ -178,6 +186,27 @@ def fit(
             f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
         )
     return scene, report
+
+
+def _object_motion(
+    clip: Clip,
+    config: RunConfig,
+    stage: ObjectMotionStage,
+    folder: Path | None,
+    report: FitReport,
+    listen: Listener,
+) -> TrackedMotion | None:
+    """The stage that comes before the start values, since these are made of what it finds."""
+    listen({"event": "stage", "stage": stage.name, "index": 0, "stages": len(config.stages)})
+    began = time.perf_counter()
+    motion = find_object_motion(clip, config.initial, stage, folder)
+    report.seconds[stage.name] = time.perf_counter() - began
+    if motion is None:
+        report.skipped.append(f"{stage.name}: the clip has no object in its masks")
+    else:
+        listen({"event": "note", "stage": stage.name, "text": in_words(motion)})
+        report.facts["object motion"] = in_words(motion)
+    return motion
 
 
 def _split(scene: Scene, stage: SplitStage) -> list[str]:

@@ -8,6 +8,7 @@ from bigs.checks import InputError, check_choice
 from bigs.train.config import (
     CompletionStage,
     GuidanceStage,
+    ObjectMotionStage,
     OptimizeStage,
     RunConfig,
     SplitStage,
@@ -35,6 +36,12 @@ def check_plan(config: RunConfig) -> None:
     if repeated:
         raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
     check_ranges("config", config)
+    for earlier, stage in pairwise(config.stages):
+        if isinstance(stage, ObjectMotionStage):
+            raise InputError(
+                f"config stages.{stage.name}: expected it first, since all is built on it, "
+                f"found it after {earlier.name}"
+            )
     for stage in config.stages:
         where = f"config stages.{stage.name}"
         if isinstance(stage, OptimizeStage):

@@ -11,6 +11,7 @@ from bigs.train.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
     RunConfig,
@@ -201,6 +202,7 @@ _DETAIL = replace(
 FAST = RunConfig(
     prior=PriorConfig("symmetry"),
     stages=(
+        ObjectMotionStage(),
         _HANDS_COARSE,
         _HANDS_FINE,
         ScaleSearchStage(),
@@ -245,6 +247,7 @@ FULL = replace(
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
     object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
     stages=(
+        ObjectMotionStage(),
         replace(_HANDS_COARSE, steps=100),
         replace(_HANDS_FINE, steps=200),
         ScaleSearchStage(),

@@ -10,6 +10,7 @@ from bigs.train.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
     RunConfig,
@@ -165,6 +166,10 @@ _INGREDIENTS = {
         _all_of(_terms("contact", "penetration"), _scale_search),
     ),
     "frame_poses": Switch("residuals of the poses of single frames", _groups(*_FRAME_POSES)),
+    "object-motion": Switch(
+        "the object's motion from tracks in its pictures",
+        lambda config: _keep(config, leave_out=ObjectMotionStage),
+    ),
     "object_smooth": Switch(
         "the object's motion: the smoothing of its estimates, and acceleration",
         _all_of(_terms("object_acceleration"), _object_smooth),

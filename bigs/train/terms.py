@@ -216,7 +216,8 @@ def betas_prior(step: Step) -> Tensor:
 
 
 def object_prior(step: Step) -> Tensor:
-    return squared_norm(step.scene.object_poses.orient) if step.has_object else torch.zeros(())
+    """Squared departure of the object's poses from their start, counted by how well each frame is known."""
+    return squared_norm(step.scene.object_poses.departures()) if step.has_object else torch.zeros(())
 
 
 def shade_prior(step: Step) -> Tensor:

@@ -7,7 +7,14 @@ import torch
 from small_scene import rotations
 
 from bigs.geometry.rotations import axis_angle_to_matrix
-from bigs.models.poses import HandPoses, ObjectPoses, RayPositions
+from bigs.models.poses import (
+    USUAL_RAY,
+    USUAL_TURN,
+    HandPoses,
+    ObjectPoses,
+    PoseErrors,
+    RayPositions,
+)
 
 T = 5
 POSITIONS = torch.tensor([0.1, -0.2, 0.6]) + 0.1 * torch.rand(
@@ -113,3 +120,25 @@ def test_gradients_of_both_modules(hand: HandPoses) -> None:
 
     check(hand)
     check(ObjectPoses(rotations(T, seed=1), POSITIONS))
+
+
+def test_residuals_of_poses_known_better_count_less() -> None:
+    turn = torch.stack(
+        [torch.diag(torch.tensor([0.1, 0.5, 1.0])) * USUAL_TURN, 4.0 * USUAL_TURN * torch.eye(3)]
+    )
+    poses = ObjectPoses(
+        rotations(2, seed=1), POSITIONS[:2], PoseErrors(turn, torch.tensor([0.25, 9.0]) * USUAL_RAY)
+    )
+    with torch.no_grad():
+        poses.orient[:] = torch.tensor([0.1, 0.2, 0.3])
+        poses.position.ray[:] = torch.tensor([0.02, 0.0])
+    found = poses(torch.arange(2))
+    for t, residual in enumerate(([0.01, 0.1, 0.3], [0.1, 0.2, 0.3])):
+        expected = axis_angle_to_matrix(torch.tensor(residual)) @ rotations(2, seed=1)[t]
+        torch.testing.assert_close(found.rotations[t], expected)
+    moved = found.centers[:, 0] - POSITIONS[:2, 0]
+    torch.testing.assert_close(moved, torch.tensor([0.005, 0.02]) * POSITIONS[:2, 2])
+    # The prior counts both in errors; of a start that nobody measured only the turn.
+    assert poses.departures().shape == (2, 5)
+    torch.testing.assert_close(poses.departures()[0, 3], torch.tensor(0.02 * USUAL_TURN / USUAL_RAY))
+    assert ObjectPoses(rotations(2, seed=1), POSITIONS[:2]).departures().shape == (2, 3)

@@ -18,8 +18,8 @@ from bigs.hand import load_hand_models
 from bigs.motion.features import FrameFeatures
 from bigs.motion.follow import FollowConfig, Matches
 from bigs.motion.models import Mapping, MappingConfig, map_features
+from bigs.motion.points import normalisation, trim_points
 from bigs.preprocess.sfm import SfmConfig, structure_from_motion
-from bigs.preprocess.sfm_points import normalisation, trim_points
 
 FRAMES = 20
 

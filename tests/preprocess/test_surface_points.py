@@ -9,9 +9,9 @@ import pytest
 import scipy.spatial
 from scipy.spatial.transform import Rotation
 
+from bigs.motion.points import normalisation
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
 from bigs.preprocess.object_surface import SurfaceConfig
-from bigs.preprocess.sfm_points import normalisation
 from bigs.preprocess.surface_points import SurfacePointsConfig, complete_points
 
 FRAMES, WIDTH, HEIGHT, UNIT = 24, 160, 120, 0.3
