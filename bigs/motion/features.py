@@ -24,6 +24,8 @@ class FeatureConfig:
 
     # The object's crop is enlarged by this before SIFT, which decides more than any other setting ...
     upscale: float = 2.0
+    # -1 lets SIFT double the crop once more, 0 takes a quarter of the time and finds half as many.
+    first_octave: int = -1
     # ... but not beyond this many pixels on its long side, as in 4K video, which may be reduced instead.
     max_side: int = 1200
     # A third of SIFT's usual contrast threshold: objects are small and evenly lit.
@@ -75,6 +77,7 @@ def extract_features(
     options = pycolmap.FeatureExtractionOptions(use_gpu=False)
     options.sift.max_num_features = config.max_features
     options.sift.peak_threshold = config.peak_threshold
+    options.sift.first_octave = config.first_octave
     features = [NOTHING] * len(images)
     # pycolmap uses all cores only on files.
     with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder, quiet_colmap():

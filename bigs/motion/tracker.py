@@ -36,11 +36,12 @@ Matches = Mapping[tuple[int, int], np.ndarray]
 class TrackerConfig:
     """How tracks are found and weighed."""
 
-    features: FeatureConfig = field(default_factory=FeatureConfig)
+    # Poses are known roughly, so half as many features do, and patches place them anew in any case.
+    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(first_octave=0))
     matching: MappingConfig = field(default_factory=MappingConfig)
     follow: FollowConfig = field(default_factory=FollowConfig)
     map: MapConfig = field(default_factory=MapConfig)
-    patches: PatchConfig = field(default_factory=PatchConfig)
+    patches: PatchConfig = field(default_factory=lambda: PatchConfig(passes=2))
     # Each frame is matched with so many later ones, ...
     overlap: int = 6
     # ... and with up to so many others that show it turned by less than this, degrees.

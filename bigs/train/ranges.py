@@ -10,6 +10,12 @@ from bigs.fields.decoders import DecoderConfig
 from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
+from bigs.motion.bundle import BundleConfig
+from bigs.motion.features import FeatureConfig
+from bigs.motion.follow import FollowConfig
+from bigs.motion.object_map import MapConfig
+from bigs.motion.patches import PatchConfig
+from bigs.motion.tracker import TrackerConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.completion import CompletionConfig
 from bigs.train.config import (
@@ -101,6 +107,29 @@ RANGES: dict[type, dict[str, Range]] = {
         "least": Range(2, 10**9),
         **dict.fromkeys(("free", "excess", "error_aside", "error_along"), _POSITIVE),
         "image_size": _PIXELS,
+    },
+    TrackerConfig: {
+        "overlap": _COUNT,
+        "turn_sigma": _POSITIVE,
+        "shift_sigma": _POSITIVE,
+        "reaches": _POSITIVE,
+        "caution": _POSITIVE,
+        "given_caution": _POSITIVE,
+    },
+    FeatureConfig: {
+        "upscale": _POSITIVE,
+        "first_octave": Range(-1, 4),
+        "max_side": Range(16, 1 << 16),
+        "max_features": _COUNT,
+    },
+    FollowConfig: {"levels": _COUNT, "half": Range(1, 100), "guides": _COUNT},
+    MapConfig: {"keep_error": _POSITIVE, "least_sightings": Range(2, 10**6)},
+    PatchConfig: {"max_side": Range(16, 1 << 16), "half": Range(1, 100), "neighbours": Range(3, 1000)},
+    BundleConfig: {
+        "pixel_sigma": _POSITIVE,
+        "turn_sigma": _POSITIVE,
+        "shift_sigma": _POSITIVE,
+        "anchor_outlier": _POSITIVE,
     },
     SplitStage: {"parts": Range(1, 10), "least_opacity": _SHARE},
     GuidanceStage: {

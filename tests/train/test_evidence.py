@@ -62,7 +62,7 @@ def hand_pixels(
 
 def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
     """At which factor on its depth does a hand's cheap silhouette fit its own mesh's outline best?"""
-    stage = replace(FAST.stages[0], image_size=size)
+    stage = replace(next(s for s in FAST.stages if s.name == "hands-coarse"), image_size=size)
     evidence = source.evidence(stage)
     targets, side, frames = evidence.targets, "right", torch.tensor([0, 6])
     verts = scene.at(frames).verts(side).detach().numpy()
