@@ -49,6 +49,7 @@ COMMANDS: Commands = {
     "bench": {
         "adjustment": bench.bench_adjustment,
         "engine": bench.bench_engine,
+        "motion": bench.bench_motion,
         "preprocess": bench.bench_preprocess,
         "reconstruct": bench.bench_reconstruct,
         "robustness": bench.bench_robustness,

@@ -187,3 +187,32 @@ def bench_adjustment(
     with telling() as tell:
         tables = run(plan, out, tell)
     print_tables(tables, out)
+
+
+def bench_motion(
+    clips: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CLIP ...")],
+    out: Path = Path("bench"),
+    variants: tuple[str, ...] = (),
+    hand_model: Path | None = None,
+    seed: int = 0,
+    threads: int = 0,
+) -> None:
+    """Track the object of clips from the poses that they come with, as they are and made worse.
+
+    Args:
+        clips: clips with gt.npz, which scores the outcome.
+        out: folder for motion.md and motion.json.
+        variants: plain, poses (a tenth of them turned by 60 degrees), masks (3 pixels too wide or narrow),
+            both; all if not given.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        seed: of what is drawn.
+        threads: CPU threads; 0 takes all.
+    """
+    use_threads(threads)
+    from bigs.commands.bench_motion import VARIANTS, MotionPlan
+    from bigs.commands.bench_motion import bench_motion as run
+
+    plan = MotionPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
+    with stderr.status("starting") as status:
+        tables = run(plan, out, status.update)
+    print_tables(tables, out)
