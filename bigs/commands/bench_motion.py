@@ -168,7 +168,7 @@ def _write(out: Path, report: dict[str, Any]) -> list[Table]:
         )  # fmt: skip
     table = Table(
         "Object motion from tracks",
-        "Errors of the turn over all frames after one turn of the object's frame, median and 90th percentile, "
+        "Errors of the turn over all frames after one turn of its frame, median and 90th percentile, "
         "and the deviation that the tracker told.",
         rows,
     )
