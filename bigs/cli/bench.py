@@ -213,6 +213,6 @@ def bench_motion(
     from bigs.commands.bench_motion import bench_motion as run
 
     plan = MotionPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
-    with stderr.status("starting") as status:
-        tables = run(plan, out, status.update)
+    with telling() as tell:
+        tables = run(plan, out, tell)
     print_tables(tables, out)

@@ -99,8 +99,9 @@ def fit(
     unknown = unknown_occluders(clip)
     motion = None
     if isinstance(config.stages[0], ObjectMotionStage):
+        watch.begin(config.stages[0].name)
         motion = _object_motion(clip, config, config.stages[0], checkpoints, report, listen)
-        began = time.perf_counter()
+        watch.begin("start values")
     start = build_scene(
         clip,
         unknown,
@@ -198,9 +199,7 @@ def _object_motion(
 ) -> TrackedMotion | None:
     """The stage that comes before the start values, since these are made of what it finds."""
     listen({"event": "stage", "stage": stage.name, "index": 0, "stages": len(config.stages)})
-    began = time.perf_counter()
     motion = find_object_motion(clip, config.initial, stage, folder)
-    report.seconds[stage.name] = time.perf_counter() - began
     if motion is None:
         report.skipped.append(f"{stage.name}: the clip has no object in its masks")
     else:
