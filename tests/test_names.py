@@ -6,6 +6,7 @@ import dataclasses
 import json
 import pickle
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from bigs.checks import InputError
+from bigs.commands.batch_job import Job, read_status, run_job
 from bigs.commands.formats import write_format
 from bigs.commands.manifest import read_manifest
 from bigs.commands.run_folder import SCENE, load_run
+from bigs.commands.series import PlannedRun
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import Clip
 from bigs.data.ho3d import load_ho3d
@@ -28,7 +31,9 @@ from bigs.data.hold import load_hold
 from bigs.data.sfm_folder import load_sfm_folder
 from bigs.data.writers import write_arctic, write_ho3d, write_nerfstudio
 from bigs.export.challenge import load_challenge
+from bigs.export.submission import check_submission
 from bigs.names import MAX_NAME_BYTES, check_inside, check_name, check_path
+from bigs.train.presets import PRESETS
 from bigs.unpickle import load_npy
 
 HOSTILE = {
@@ -94,17 +99,22 @@ def rename(clip: Path, name: Any) -> None:
     np.save(file, np.array({**load_npy(file), "seq_name": name}, dtype=np.object_))
 
 
+def named_clip(clip: Path, folder: Path, name: str) -> Path:
+    """A clip like another, whose sequence has this name."""
+    (folder / "build").mkdir(parents=True)
+    for part in ("image", "mask"):
+        (folder / "build" / part).symlink_to(clip / "build" / part)
+    for part in ("data.npy", "corres.txt"):
+        shutil.copy(clip / "build" / part, folder / "build")
+    rename(folder, name)
+    return folder
+
+
 @hostile
 def test_a_clip_cannot_write_anywhere(
     name: str, tiny_clip: Path, tmp_path: Path, call: Callable[..., Answer]
 ) -> None:
-    clip = tmp_path / "inside" / "clip"
-    (clip / "build").mkdir(parents=True)
-    for part in ("image", "mask"):
-        (clip / "build" / part).symlink_to(tiny_clip / "build" / part)
-    for part in ("data.npy", "corres.txt"):
-        shutil.copy(tiny_clip / "build" / part, clip / "build")
-    rename(clip, name)
+    clip = named_clip(tiny_clip, tmp_path / "inside" / "clip", name)
     before = contents(tmp_path)
     for command in (
         ["reconstruct", clip, "--out", tmp_path / "run", "--preset", "smoke"],
@@ -115,6 +125,32 @@ def test_a_clip_cannot_write_anywhere(
         assert answer.code == 2
         assert_refused(answer, "data.npy: seq_name: expected a plain name, found '")
     assert contents(tmp_path) == before
+
+
+@hostile
+def test_a_job_of_a_batch(name: str, tiny_clip: Path, tmp_path: Path) -> None:
+    """It writes into its own folder alone, and says that another attempt is of no use."""
+    clip, folder = named_clip(tiny_clip, tmp_path / "clip", name), tmp_path / "batch" / "job"
+    before = contents(tmp_path)
+    run_job(Job(PlannedRun(folder, clip, PRESETS["smoke"], None, None), 1, "x"))
+    status = read_status(folder)
+    assert (status.state, status.again) == ("failed", False)
+    assert "data.npy: seq_name: expected a plain name, found '" in status.error
+    shutil.rmtree(tmp_path / "batch")
+    assert contents(tmp_path) == before
+
+
+@hostile
+def test_members_of_a_submission(name: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "preds.zip", "w") as archive:
+        try:
+            archive.writestr(f"arctic_preds/{name}.pt", b"")
+        except UnicodeEncodeError:
+            archive.writestr(f"{name.encode('utf8', 'surrogatepass').decode('cp437')}", b"")
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=r"preds\.zip: expected") as caught:
+        check_submission(tmp_path / "preds.zip", ["one"])
+    assert len(str(caught.value).splitlines()) == 1 and contents(tmp_path) == before
 
 
 @hostile
