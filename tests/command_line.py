@@ -36,15 +36,19 @@ def run_bigs(*arguments: str | Path) -> Answer:
 
 
 def assert_refused(answer: Answer, *words: str) -> None:
-    """Not 0, nothing on stdout, and exactly one line on stderr with `words` in this order."""
+    """Not 0, nothing on stdout, and on stderr one sentence with `words` in this order.
+
+    What was going on before may have been told, a line each.
+    """
     assert answer.code != 0
     assert answer.out == ""
-    lines = answer.err.splitlines()
-    assert len(lines) == 1, answer.err
+    *told, sentence = answer.err.splitlines()
+    assert sentence.startswith("bigs: "), answer.err
+    assert not any(line.startswith(("bigs: ", "Traceback", " ")) for line in told), answer.err
     position = 0
     for word in words:
-        found = lines[0].find(word, position)
-        assert found >= 0, f"{word!r} not in {lines[0]!r}"
+        found = sentence.find(word, position)
+        assert found >= 0, f"{word!r} not in {sentence!r}"
         position = found + len(word)
 
 

@@ -145,6 +145,7 @@ def _work(plan: BatchPlan, engine: Engine, waiting: deque[Job], at_once: int, li
                 waiting.append(job)
             job.run.folder.mkdir(parents=True, exist_ok=True)
             write_status(job.run.folder, status)
+        listen(f"{job.name}: {status.state}" + (f", {status.error}" if status.error else ""))
         _summarise(plan)
 
 

@@ -12,8 +12,8 @@ from rich.console import Console
 
 # Seconds after which a line says where it is, though nothing new has begun.
 PATIENCE = 30.0
-# "12/300": the rest of a text says what is done, this how far it is.
-_COUNT = re.compile(r"\d+/\d+")
+# In "step 12/300" or "30 frames" the words say what is done, the numbers how far it is.
+_COUNT = re.compile(r"\d+")
 
 
 class Spoken:

@@ -28,14 +28,9 @@ class _Heard(io.StringIO):
 def test_a_line_for_each_thing_and_not_for_how_far_it_is() -> None:
     text = io.StringIO()
     lines = Spoken(Console(file=text))
-    for line in ("run: contact 1/9", "run: contact 2/9", "run: joint 1/9", "1 of 2 clips", "2 of 2 clips"):
+    for line in ("run: contact 1/9", "run: contact 2/9", "run: joint 1/9", "1 frames", "2 frames"):
         lines.update(line)
-    assert text.getvalue().splitlines() == [
-        "run: contact 1/9",
-        "run: joint 1/9",
-        "1 of 2 clips",
-        "2 of 2 clips",
-    ]
+    assert text.getvalue().splitlines() == ["run: contact 1/9", "run: joint 1/9", "1 frames"]
 
 
 def test_long_parts_say_where_they_are() -> None:

@@ -84,6 +84,7 @@ def test_labels_of_masks_are_said_on_the_command_line(call: Call, given: Given, 
 def test_refusals_are_one_sentence(call: Call, given: Given, tmp_path: Path) -> None:
     clip, none = tmp_path / "clip", tmp_path / "none"
     everything = options(given)
+    keypoints = everything[2:]
     without_object = tmp_path / "bare"
     shutil.copytree(given.masks, without_object / "right")
     for arguments, words in (
@@ -93,19 +94,31 @@ def test_refusals_are_one_sentence(call: Call, given: Given, tmp_path: Path) -> 
         ),
         (["preprocess", str(given.pictures), "--out", str(clip)], ["expected masks", "give --masks DIR"]),
         (
+            ["preprocess", str(given.pictures), "--out", str(clip), *everything[:2]],
+            ["expected estimates of the hands", "give --keypoints FILE"],
+        ),
+        (
             ["preprocess", str(given.pictures), "--out", str(clip), "--masks", str(none)],
             ["none: expected a folder of masks, found nothing"],
         ),
         (
-            ["preprocess", str(given.pictures), "--out", str(clip), "--masks", str(without_object)],
+            [
+                "preprocess",
+                str(given.pictures),
+                "--out",
+                str(clip),
+                "--masks",
+                str(without_object),
+                *keypoints,
+            ],
             ["expected an object in the video", "no object pixel in any of 12 frames", "give masks"],
         ),
         (
-            ["preprocess", str(given.pictures), "--out", str(clip), "--sam2", str(none)],
+            ["preprocess", str(given.pictures), "--out", str(clip), "--sam2", str(none), *keypoints],
             ["none: expected a folder with the weights", "found no such folder", "--masks"],
         ),
         (
-            ["preprocess", str(given.pictures), "--out", str(clip), "--sam2", str(clip)],
+            ["preprocess", str(given.pictures), "--out", str(clip), "--sam2", str(clip), *keypoints],
             ["--sam2: expected --clicks FILE"],
         ),
         (
