@@ -97,7 +97,8 @@ fn size(dice: &mut Dice) -> usize {
 fn values<T: Scalar>(dice: &mut Dice, count: usize) -> Vec<T> {
     let wildness = [dice::Wildness::Tame, dice::Wildness::Finite][dice.below(2)];
     (0..count.min(2000))
-        .map(|_| dice::scalar(dice, wildness, -1.0, 1.0))
+        // What is summed over pixels and weighted by gradients needs room to grow.
+        .map(|_| dice::scalar::<T>(dice, wildness, -1.0, 1.0).limit(T::of(-1e15), T::of(1e15)))
         .collect()
 }
 
