@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -223,10 +225,10 @@ def binary(tmp_path: Path, in_camera: Clip) -> Path:
 
 def test_a_binary_model_that_is_cut_is_told(binary: Path) -> None:
     check_model_files(binary)
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"):
         file = binary / name
         content = file.read_bytes()
-        for keep in (0, 5, 30, len(content) // 2, len(content) - 1):
+        for keep in (0, 5, min(30, len(content) - 3), len(content) // 2, len(content) - 1):
             file.write_bytes(content[:keep])
             with pytest.raises(InputError, match=f"{name}: "):
                 load_sfm_folder(binary.parent.parent)
@@ -246,3 +248,32 @@ def test_a_camera_without_a_focal_length(binary: Path, focal: float) -> None:
     file.write_bytes(content)
     with pytest.raises(InputError, match=r"camera"):
         load_sfm_folder(binary.parent.parent)
+
+
+@pytest.mark.parametrize("name", ["rigs.bin", "frames.bin"])
+def test_counts_that_a_reader_would_follow_for_hours(binary: Path, name: str) -> None:
+    content = (binary / name).read_bytes()
+    for place in range(8, len(content) - 4):
+        (binary / name).write_bytes(content[:place] + b"\xff\xff\xff\x7f" + content[place + 4 :])
+        with contextlib.suppress(InputError):
+            check_model_files(binary)
+    (binary / name).write_bytes(struct.pack("<Q", 2**60) + content[8:])
+    with pytest.raises(InputError, match=f"{name}: expected a whole file"):
+        check_model_files(binary)
+
+
+@pytest.mark.parametrize("name", ["rigs.bin", "frames.bin", "rigs.txt", "cameras.bin"])
+def test_a_pipe_in_a_model(binary: Path, name: str) -> None:
+    (binary / name).unlink(missing_ok=True)
+    (binary / name).with_suffix(".bin").unlink(missing_ok=True)
+    os.mkfifo(binary / name)
+    with pytest.raises(InputError, match=rf"{name}: expected a.* COLMAP model, found a pipe"):
+        check_model_files(binary)
+
+
+def test_a_rig_of_several_cameras(binary: Path) -> None:
+    """Two sensors, of which the second has a pose, as COLMAP writes them."""
+    second = struct.pack("<iIB7d", 0, 2, 1, 1, 0, 0, 0, 0, 0, 0)
+    third = struct.pack("<iIB", 0, 3, 0)
+    (binary / "rigs.bin").write_bytes(struct.pack("<QIIiI", 1, 1, 3, 0, 1) + second + third)
+    check_model_files(binary)
