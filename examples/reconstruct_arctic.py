@@ -23,7 +23,7 @@ from typing import Literal
 import tyro
 
 from bigs.checks import InputError
-from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.evaluation import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.preprocess import preprocess
 from bigs.commands.preprocess_request import PreprocessRequest
 from bigs.commands.reconstruct import reconstruct
@@ -88,7 +88,7 @@ def main(
         for table in compare_runs(scores, out):
             print(f"\n{table.title}")
             for first, *rest in table.rows:
-                print(f"{first:34s}" + "".join(f"{cell:>12s}" for cell in rest))
+                print(f"{first:56s}" + "".join(f"{cell:>12s}" for cell in rest))
     archive = out / "arctic_preds.zip"
     for sequence, length, _ in submit(archive, list(runs.values()), sequences)[1:]:
         print(f"{sequence}: {length} frames submitted")
@@ -144,6 +144,7 @@ def stand_in(folder: Path, frames: int) -> Path:
     images = [loaded.image(t) for t in range(frames)]
     annotation = load_annotation(clip)
     write_arctic(folder, annotation, subject="s99", sequence="bottle_grab_01", images=images, offset=0)
+    (folder / MADE_BY_CODE).write_text("Everything below was generated: no clip of the data set.\n")
     return folder
 
 

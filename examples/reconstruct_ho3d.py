@@ -24,7 +24,7 @@ import tyro
 
 from bigs.checks import InputError
 from bigs.commands.convert import ConvertPlan, convert
-from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.evaluation import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.reconstruct import reconstruct
 from bigs.data.ground_truth import load_annotation
 from bigs.data.ho3d import CV_FROM_GL
@@ -86,7 +86,7 @@ def main(
     for table in compare_runs(scores, out):
         print(f"\n{table.title}")
         for first, *rest in table.rows:
-            print(f"{first:28s}" + "".join(f"{cell:>12s}" for cell in rest))
+            print(f"{first:40s}" + "".join(f"{cell:>12s}" for cell in rest))
     return scores[run.name].scores["result"]
 
 
@@ -113,6 +113,7 @@ def stand_in(folder: Path, frames: int) -> Path:
     # HO-3D numbers its frames from 0 with four digits; the clip shall call them the same.
     names = "".join(f"{t:04d}.jpg\n" for t in range(frames))
     (clip / "build" / "corres.txt").write_text(names)
+    (folder / MADE_BY_CODE).write_text("Everything below was generated: no clip of the data set.\n")
     return folder
 
 

@@ -22,8 +22,11 @@ import scipy.spatial
 import torch
 import trimesh
 import tyro
+from rich.console import Console
 
 from bigs.commands.prior_train import Shape, cover, read_shape, train_prior
+from bigs.commands.progress import steps_listener
+from bigs.commands.spoken import spoken
 from bigs.geometry.mesh import frames_from_normals, sample_surface, vertex_normals
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.guidance.cameras import make_orbit
@@ -74,9 +77,14 @@ def main(
         write_meshes(out / "learn_from", learn_from, 0)
         prior = out / "prior.safetensors"
         config = PixelTrainingConfig(steps, batch=16, lr=1e-3, net=PixelConfig(width))
-        train_prior(out / "learn_from", prior, config)
+        with steps_listener(Console(stderr=True), "training the prior") as listen:
+            train_prior(out / "learn_from", prior, config, listen=listen)
     denoiser = load_pixel_denoiser(prior)
-    found = [completed(file, denoiser, stage_steps) for file in others]
+    found = []
+    with spoken(Console(stderr=True)) as lines:
+        for number, file in enumerate(others, 1):
+            lines.say(f"completing {file.name}, {number} of {len(others)}")
+            found.append(completed(file, denoiser, stage_steps))
     text = "\n".join(table(found))
     (out / "prior.md").write_text(text + "\n")
     print(text)

@@ -129,7 +129,9 @@ def test_reconstruct_arctic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert clip.frames == 8
     rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
     assert "8 frames submitted" in " ".join(rows[f"{example.STAND_IN}: 8 frames submitted"])
-    assert rows["paper: HOLD"][2:] == ["105.92", "123.54", "2.07", "63.92", "27.13", "24.70"]
+    # The paper's figures are of ARCTIC's own clips.
+    assert f"{example.STAND_IN} (8 frames, made by code)" in rows
+    assert not any(name.startswith("paper") for name in rows)
     # Called again it keeps its run and packs the same zip.
     before = archive.read_bytes()
     example.main(tmp_path / "arctic", frames=8)

@@ -64,7 +64,8 @@ def evaluate(
             + ("" if all else ", or --all; they stand in report.html, too")
         )
     elif out is None:
-        for table in beside_paper({name: evaluation.scores["result"] for name, evaluation in found.items()}):
+        scores = {name: evaluation.scores["result"] for name, evaluation in found.items()}
+        for table in beside_paper(scores, {name: evaluation.input for name, evaluation in found.items()}):
             say(f"\n{table.title}")
             print_table(table.rows)
             say(table.note)

@@ -22,6 +22,10 @@ from bigs.commands.batch_job import Job, run_job
 _POLL = 0.5
 
 
+# Longer notices of schedulers are not repeated.
+_LONGEST_NOTICE = 60
+
+
 class Engine(Protocol):
     """Jobs in, jobs out, in any order."""
 
@@ -103,7 +107,7 @@ class SlurmJobs:
                         error = task.exception()
                     except self._unknown as lost:
                         error = lost
-                    return job, "" if error is None else _first_line(error)
+                    return job, "" if error is None else _notice(error)
             time.sleep(_POLL)
 
     def close(self) -> None:
@@ -156,7 +160,7 @@ class RayCluster:
         try:
             self._ray.get(done)
         except self._ray.exceptions.RayError as error:
-            return job, _first_line(error)
+            return job, _notice(error)
         return job, ""
 
     def close(self) -> None:
@@ -173,6 +177,8 @@ def _death(code: int | None) -> str:
     return f"its process was killed ({signal.Signals(-code).name})"
 
 
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return f"its worker died ({type(error).__name__}{': ' + lines[0] if lines else ''})"
+def _notice(error: BaseException) -> str:
+    """A scheduler's notice of a death, of which some are pages long, as one of ours."""
+    sentence = " ".join(str(error).split()).partition(". ")[0].rstrip(".")
+    reason = sentence if len(sentence) <= _LONGEST_NOTICE else type(error).__name__
+    return f"its worker was killed or crashed ({reason or type(error).__name__})"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,13 @@ from bigs.atomic import atomic_write
 from bigs.bench.page import Table, page
 from bigs.checks import InputError
 from bigs.commands.clips import open_clip
-from bigs.commands.paper_tables import beside_paper, mean_scores
+from bigs.commands.paper_tables import RunInput, beside_paper, mean_scores
 from bigs.commands.pictures import frame_scores, means, novel_scores, partly
 from bigs.commands.run_clip import hand_models_of_run, origin_of
 from bigs.commands.run_folder import METRICS, REPORT, load_run, read_scores, write_json
 from bigs.commands.truth import find_ground_truth, is_own_truth, load_truth
 from bigs.data.base import Clip
+from bigs.data.ho3d import find_ho3d
 from bigs.data.novel import CAMERAS
 from bigs.hand import HandModel, load_hand_models
 from bigs.losses.perceptual import VggWeights, perceptual_distance
@@ -34,6 +36,8 @@ from bigs.types import Side
 from bigs.viewer.report import replace_scores
 
 FRAMES = "frames.csv"
+# In a folder of data, or above it: that it was generated, whatever its layout.
+MADE_BY_CODE = "made_by_code.txt"
 SCORES = "scores.csv"
 COMPARISON = "comparison.md"
 COMPARISON_NUMBERS = "comparison.csv"
@@ -69,6 +73,7 @@ class Evaluation:
     frames: dict[str, np.ndarray]  # by key, [T]
     remarks: tuple[str, ...]  # what could not be scored, and what to keep in mind
     told: dict[str, str]  # why a score is missing, or over how many frames it is, by key
+    input: RunInput = field(default_factory=RunInput)
 
     def table(self) -> list[tuple[str, ...]]:
         """All scores as rows of text."""
@@ -150,10 +155,27 @@ def evaluate_run(
     write_json(run / METRICS, scores)
     _write_frames(run / FRAMES, playback.frame_names, frames)
     _write_scores(run / SCORES, scores)
-    evaluation = Evaluation(playback.name, scores, frames, tuple(remarks), told)
+    given = _input_of(playback, truth_path, clip_path)
+    evaluation = Evaluation(playback.name, scores, frames, tuple(remarks), told, given)
     if (run / REPORT).is_file() and not replace_scores(run / REPORT, evaluation.table()):
         remarks.append(f"{REPORT} is of an earlier version and keeps its scores")
     return replace(evaluation, remarks=tuple(remarks))
+
+
+def _input_of(playback: Playback, truth: Path | None, clip: Path | None) -> RunInput:
+    """What a run was made from: a data set's clip is known by its truth, or by its name."""
+    places = [place for path in (truth, clip) if path is not None for place in (path, *path.parents)]
+    told = f"{len(playback)} frames"
+    if any((place / MADE_BY_CODE).is_file() for place in places):
+        return RunInput("", f"{told}, made by code")
+    data_set = ""
+    if truth is not None and not is_own_truth(truth):
+        data_set = "HO-3D" if truth.is_dir() and find_ho3d(truth) is not None else "ARCTIC"
+    elif re.fullmatch(r"arctic_s\d+_.+_\d", playback.name):
+        data_set = "ARCTIC"
+    elif re.fullmatch(r"hold_.+_ho3d", playback.name):
+        data_set = "HO-3D"
+    return RunInput(data_set, f"{told} of {data_set}" if data_set else told)
 
 
 def run_names(runs: Sequence[Path]) -> list[str]:
@@ -174,7 +196,7 @@ def compare_runs(runs: Mapping[str, Evaluation], out: Path) -> list[Table]:
     """Write the scores of several runs beside the paper's: `comparison.md` and, with every score, a CSV."""
     out.mkdir(parents=True, exist_ok=True)
     results = {name: evaluation.scores["result"] for name, evaluation in runs.items()}
-    tables = beside_paper(results)
+    tables = beside_paper(results, {name: evaluation.input for name, evaluation in runs.items()})
     columns = results | ({"mean": mean_scores(results)} if len(results) > 1 else {})
     everything = Table("All scores", OFFICIAL_NOTES, comparison_table(columns, ALL_METRICS, details=True))
     keys = [key for key in ALL_METRICS if any(key in scores for scores in results.values())]

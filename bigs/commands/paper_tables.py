@@ -13,10 +13,19 @@ Scores = Mapping[str, float]
 _PAPER = "paper"
 
 
+class RunInput(NamedTuple):
+    """What a run was made from."""
+
+    data_set: str = ""  # ARCTIC or HO-3D; "" for anything else
+    told: str = ""  # as it stands behind the run's name
+
+
 class PaperTable(NamedTuple):
     """A table of the paper."""
 
     title: str
+    ours: str  # the title where no run is of the paper's data
+    data_sets: tuple[str, ...]
     columns: dict[str, str]  # our key -> the heading, with the unit
     rows: dict[str, tuple[float | None, ...]]  # method -> figures in the columns' order
 
@@ -24,6 +33,8 @@ class PaperTable(NamedTuple):
 # Figures as printed. The paper gives CD in cm² throughout (`cd_*_sq`).
 TWO_HANDS = PaperTable(
     "ARCTIC, two hands (the paper's Table 1: mean of nine clips)",
+    "Two hands",
+    ("ARCTIC",),
     {
         "cd_l_sq": "CD_l cm²",
         "cd_r_sq": "CD_r cm²",
@@ -41,6 +52,8 @@ TWO_HANDS = PaperTable(
 )
 ONE_HAND = PaperTable(
     "HO-3D v3, right hand (the paper's Table 2: mean of 18 clips)",
+    "One hand",
+    ("HO-3D",),
     {"cd_r_sq": "CD_r cm²", "cd_icp_sq": "CD_o cm²", "f10_icp": "F10 %", "mpjpe_ra_r": "MPJPE_r mm"},
     {
         "full view: HOMan": (78.2, None, None, 32.0),
@@ -54,6 +67,8 @@ ONE_HAND = PaperTable(
 )
 PICTURES = PaperTable(
     "Rendering (the paper's Table 4)",
+    "Rendering",
+    ("ARCTIC", "HO-3D"),
     {"psnr_full": "PSNR dB", "ssim_full": "SSIM", "lpips_full": "LPIPS"},
     {
         "ARCTIC: HOLD": (12.83, 0.66, 0.32),
@@ -69,19 +84,26 @@ _NOTES = {
     PICTURES.title: "Ours: the render against the true frame blanked outside its mask, over black, all "
     "pixels counting. The paper does not say what it masks.",
 }
+_ELSEWHERE = (
+    "CD in the squared form. The paper's figures are means over clips of ARCTIC and HO-3D and "
+    "stand only beside runs of those."
+)
 
 
-def beside_paper(runs: Mapping[str, Scores]) -> list[Table]:
+def beside_paper(runs: Mapping[str, Scores], inputs: Mapping[str, RunInput]) -> list[Table]:
     """The tables that the runs have scores for, with a mean where there are several runs.
+
+    The paper's rows stand only in tables with a run of the data set that they are of.
 
     Args:
         runs: name -> its scores under the keys of `bigs.metrics`.
+        inputs: name -> what it was made from.
     """
     two = {name: scores for name, scores in runs.items() if "mpjpe_ra_l" in scores}
     one = {name: scores for name, scores in runs.items() if "mpjpe_ra_r" in scores and name not in two}
     drawn = {name: scores for name, scores in runs.items() if "psnr_full" in scores}
     chosen = ((TWO_HANDS, two), (ONE_HAND, one), (PICTURES, drawn))
-    return [_table(paper, scores) for paper, scores in chosen if scores]
+    return [_table(paper, scores, inputs) for paper, scores in chosen if scores]
 
 
 def mean_scores(runs: Mapping[str, Scores]) -> dict[str, float]:
@@ -90,14 +112,23 @@ def mean_scores(runs: Mapping[str, Scores]) -> dict[str, float]:
     return {key: float(np.mean([scores[key] for scores in runs.values()])) for key in keys}
 
 
-def _table(paper: PaperTable, runs: Mapping[str, Scores]) -> Table:
-    rows = {name: [scores.get(key) for key in paper.columns] for name, scores in runs.items()}
+def _table(paper: PaperTable, runs: Mapping[str, Scores], inputs: Mapping[str, RunInput]) -> Table:
+    given = {name: inputs.get(name, RunInput()) for name in runs}
+    known = {one.data_set for one in given.values()} & set(paper.data_sets)
+    labels = {name: f"{name} ({one.told})" if one.told else name for name, one in given.items()}
+    rows = {labels[name]: [scores.get(key) for key in paper.columns] for name, scores in runs.items()}
     if len(runs) > 1:
         mean = mean_scores(runs)
         rows[f"mean of {len(runs)}"] = [mean.get(key) for key in paper.columns]
-    rows |= {f"{_PAPER}: {method}": list(figures) for method, figures in paper.rows.items()}
+    rows |= {
+        f"{_PAPER}: {method}": list(figures)
+        for method, figures in paper.rows.items()
+        if known and (len(paper.data_sets) == 1 or method.split(":")[0] in known)
+    }
     body = [(name, *map(_cell, figures)) for name, figures in rows.items()]
-    return Table(paper.title, _NOTES[paper.title], [("", *paper.columns.values()), *body])
+    note = _NOTES[paper.title] if known else _ELSEWHERE
+    title = paper.title if known else paper.ours
+    return Table(title, note, [("", *paper.columns.values()), *body])
 
 
 def _cell(value: float | None) -> str:

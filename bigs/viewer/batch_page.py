@@ -15,7 +15,9 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
 table { border-collapse: collapse; width: 100%; }
 th, td { padding: .3em .7em; border-bottom: 1px solid #8886; text-align: left; vertical-align: top; }
-td { font-variant-numeric: tabular-nums; } img { width: 320px; display: block; }
+th:nth-last-child(2) { min-width: 12em; }
+td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+img { width: 320px; max-width: 25vw; display: block; }
 .finished { color: #1a7f37; } .failed { color: #cf222e; } .running { color: #9a6700; }
 """
 

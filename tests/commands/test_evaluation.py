@@ -16,7 +16,7 @@ from PIL import Image
 from small_vgg import lpips_channels, torchvision_state
 
 from bigs.commands.evaluation import Evaluation, EvaluationPlan, compare_runs, evaluate_run
-from bigs.commands.paper_tables import beside_paper
+from bigs.commands.paper_tables import RunInput, beside_paper
 from bigs.commands.pictures import novel_scores
 from bigs.commands.rendering import render_frame
 from bigs.data.base import Clip
@@ -191,7 +191,8 @@ def test_lpips_needs_both_files(run: Path, call: Callable[..., Answer], tmp_path
     torch.save(lpips_channels(), tmp_path / "lin.pth")
     refused = call("eval", run, "--perceptual-weights", tmp_path / "vgg.pth")
     assert_refused(refused, "--perceptual-weights: expected LPIPS's channel weights", "vgg.pth")
-    answer = call("eval", run, "--perceptual-weights", tmp_path / "vgg.pth", tmp_path / "lin.pth")
+    files = (tmp_path / "vgg.pth", tmp_path / "lin.pth")
+    answer = call("eval", run, "--all", "--perceptual-weights", *files)
     assert answer.code == 0 and "LPIPS of the foreground" in answer.out
     result = json.loads((run / "metrics.json").read_text())["result"]
     assert 0 < result["lpips_foreground"] < result["lpips_full"]
@@ -202,9 +203,10 @@ def test_runs_stand_beside_the_paper(run: Path, call: Callable[..., Answer], tmp
     answer = call("eval", run, tmp_path / "other", "--out", tmp_path / "table")
     assert answer.code == 0, answer.err
     text = (tmp_path / "table" / "comparison.md").read_text()
-    for row in ("| run |", "| other |", "| mean of 2 |", "| paper: HOLD | 105.92 | 123.54 | 2.07 | 63.92 |"):
+    frames = len(columns(run / "frames.csv")["frame"])
+    for row in (f"| run ({frames} frames) |", f"| other ({frames} frames) |", "| mean of 2 |"):
         assert row in text
-    assert "Table 4" in text and "Table 2" not in text and "computes CD_r and CD_l from plain" in text
+    assert "paper: " not in text and "computes CD_r and CD_l from plain" in text
     table = columns(tmp_path / "table" / "comparison.csv")
     result = json.loads((run / "metrics.json").read_text())["result"]
     np.testing.assert_array_equal(table["run"], ["run", "other"])
@@ -215,11 +217,24 @@ def test_runs_stand_beside_the_paper(run: Path, call: Callable[..., Answer], tmp
 
 def test_a_run_without_left_hand_stands_beside_table_2() -> None:
     one = {"mpjpe_ra_r": 10.0, "cd_r_sq": 2.0, "cd_icp_sq": 0.5, "f10_icp": 90.0}
-    (table,) = beside_paper({"SM1": one, "SM2": one | {"cd_r_sq": 4.0}})
+    clips = dict.fromkeys(("SM1", "SM2"), RunInput("HO-3D"))
+    (table,) = beside_paper({"SM1": one, "SM2": one | {"cd_r_sq": 4.0}}, clips)
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["SM1"] == ("2.00", "0.50", "90.00", "10.00") and rows["mean of 2"][0] == "3.00"
     assert rows["paper: limited view: BIGS"] == ("21.70", "1.24", "84.02", "24.22")
     assert rows["paper: full view: HOMan"] == ("78.20", "-", "-", "32.00")
+
+
+def test_the_papers_rows_stand_beside_its_own_data_alone() -> None:
+    one = {"mpjpe_ra_r": 10.0, "mpjpe_ra_l": 10.0, "psnr_full": 20.0}
+    two, drawn = beside_paper({"a": one}, {"a": RunInput("", "16 frames, made by code")})
+    assert (
+        [row[0] for row in two.rows] == [row[0] for row in drawn.rows] == ["", "a (16 frames, made by code)"]
+    )
+    assert "ARCTIC" not in two.title and "paper" not in drawn.title
+    two, drawn = beside_paper({"a": one}, {"a": RunInput("ARCTIC")})
+    assert "paper: BIGS" in {row[0] for row in two.rows}
+    assert {row[0] for row in drawn.rows[2:]} == {"paper: ARCTIC: HOLD", "paper: ARCTIC: BIGS"}
 
 
 def test_nothing_to_score_against(run: Path, call: Callable[..., Answer], tmp_path: Path) -> None:
@@ -259,5 +274,5 @@ def test_a_submission_from_runs(run: Path, call: Callable[..., Answer], tiny: Cl
 
 def test_a_comparison_names_what_it_shows(own: Evaluation, tmp_path: Path) -> None:
     tables = compare_runs({"only": own}, tmp_path / "out")
-    assert [row[0] for row in tables[0].rows][:2] == ["", "only"]
+    assert [row[0] for row in tables[0].rows][:2] == ["", "only (12 frames)"]
     assert not any(row[0].startswith("mean") for table in tables for row in table.rows)

@@ -4,6 +4,7 @@ import base64
 import io
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image
 
 from bigs.checks import InputError
 from bigs.viewer.plot import line_plot
-from bigs.viewer.report import write_report
+from bigs.viewer.report import replace_scores, write_report
 
 VOID = {"meta", "img", "br", "input"}
 
@@ -147,3 +148,16 @@ def test_hard_values_plot_without_trouble():
     long = curve_points(line_plot("long", list(range(10_000)), [float(v) for v in range(10_000)]))
     assert len(long) <= 402
     assert long[-1] == (352.0, 24.0)
+
+
+def test_scores_that_come_later_take_the_place_of_earlier_ones(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(
+        path, title="run", metrics=[("score", "result"), ("F10", "1.00")], timings=lambda: {"fit": 2.0}
+    )
+    assert replace_scores(path, [("score", "initial", "result"), ("F10", "7.00", "9.00")])
+    text = path.read_text()
+    assert text.count("Scores</h2>") == 1
+    assert "<td>9.00</td>" in text and "<td>1.00</td>" not in text and "<td>2.0</td>" in text
+    path.write_text("<html>of another version</html>")
+    assert not replace_scores(path, [("score", "result")])
