@@ -151,7 +151,8 @@ def check_choice(name: str, value: Any, choices: Iterable[Any], kind: str = "nam
         kind: what the choices are ("terms"), for lists that are too long to be recited.
     """
     accepted = list(choices)
-    if value not in accepted:
+    # An array is no choice, and compares entry by entry.
+    if isinstance(value, np.ndarray | torch.Tensor) or value not in accepted:
         raise InputError(f"{name}: {expected_among(value, accepted, kind)}")
 
 

@@ -85,3 +85,11 @@ def test_the_nearest_neighbour_of_a_missing_file_is_named(tmp_path: Path) -> Non
     assert found_at(tmp_path / "zzz") == found_at(tmp_path / "none" / "camera.json") == "nothing"
     assert found_at(tmp_path) == "a folder"
     assert found_at(tmp_path / "cameras.json") == "a file"
+
+
+@pytest.mark.parametrize(
+    "value", [np.ones(3), np.array(["a", "b"]), np.array("a"), torch.ones(2), ["a"], {}, None]
+)
+def test_what_is_no_choice_at_all(value: object) -> None:
+    with pytest.raises(InputError, match="order: expected one of a, b, found"):
+        check_choice("order", value, ("a", "b"))

@@ -65,7 +65,8 @@ def load_hold(path: str | Path) -> Clip:
 
     data = mapping_field(str(file), load_npy(file))
     name = data.get("seq_name")
-    name = check_name(f"{file}: seq_name", _sequence_name(folder) if name in (None, "") else name)
+    nameless = name is None or (isinstance(name, str) and not name)
+    name = check_name(f"{file}: seq_name", _sequence_name(folder) if nameless else name)
     frames = len(image_paths)
     height, width = read_image(image_paths[0]).shape[:2]
     K, cam_from_world, scene_scale = _read_cameras(file, data, frames, width)

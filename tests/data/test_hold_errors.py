@@ -173,6 +173,8 @@ CASES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "singular norm_mat": (entity("object", "norm_mat", np.zeros((4, 4))), ("norm_mat", "invertible")),
     "all invalid": (entity("left", "is_valid", np.zeros(FRAMES)), ("left.is_valid", "at least one")),
     "odd validity": (entity("left", "is_valid", np.full(FRAMES, 2)), ("left.is_valid", "2")),
+    "a name that is an array": (lambda d: d.__setitem__("seq_name", np.ones(3)), ("seq_name", "not text")),
+    "a name that is a list": (lambda d: d.__setitem__("seq_name", []), ("seq_name", "not text")),
     "no entity": (lambda d: d["entities"].clear(), ("entities", "right, left, object", "none")),
     "no entities": (lambda d: d.pop("entities"), ("entities",)),
     "no cameras": (lambda d: d.pop("cameras"), ("cameras",)),
