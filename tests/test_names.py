@@ -24,6 +24,7 @@ from bigs.commands.formats import write_format
 from bigs.commands.manifest import read_manifest
 from bigs.commands.run_folder import SCENE, load_run
 from bigs.commands.series import PlannedRun
+from bigs.commands.view import view
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import Clip
 from bigs.data.ho3d import load_ho3d
@@ -169,6 +170,8 @@ def test_every_format_refuses_a_scene_of_such_a_name(
         answer = call("export", run, "--format", form, "--out", tmp_path / "out")
         assert answer.code == 2
         assert_refused(answer, "scene.safetensors: name: expected a plain name, found '")
+    with pytest.raises(InputError, match=r"scene\.safetensors: name: expected a plain name"):
+        view(run, port=0)
     assert contents(tmp_path) == before
     with pytest.raises(InputError, match="expected a plain name"):
         dataclasses.replace(load_run(finished_run.folder), name=name)
