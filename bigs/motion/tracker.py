@@ -19,7 +19,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from bigs.geometry.rotations import robust_mean_rotation
-from bigs.motion.bundle import Anchor, pose_covariances
+from bigs.motion.bundle import Anchor, BundleConfig, pose_covariances
 from bigs.motion.features import FeatureConfig, FrameFeatures, extract_features
 from bigs.motion.follow import FollowConfig, follow
 from bigs.motion.models import MappingConfig, match_features
@@ -63,6 +63,9 @@ class TrackerConfig:
     # Sightings err together more than one by one: true errors are about so many times those of independent
     # ones.
     caution: float = 3.0
+    # More, up to this, where poses leave the given ones for long by so many of these' standard deviations.
+    most_caution: float = 48.0
+    most_departure: float = 2.5
     # So do given poses of neighbouring frames: where only they speak, smoothing them makes them no surer.
     given_caution: float = 3.0
     # A frame with fewer sightings tells nothing about the given poses' errors.
@@ -136,10 +139,7 @@ def track_matches(
     sharpen(map_, Pictures(images, masks, config.patches), config.patches)
 
     map_.anchor = measured_anchor(map_, map_.anchor, config)
-    uncertain = replace(
-        config.map.bundle, pixel_sigma=config.caution * config.map.bundle.pixel_sigma, iterations=30
-    )
-    map_.adjust(frames, np.ones(len(frames), dtype=bool), uncertain)
+    uncertain = _fused(map_, config)
     bundle, _ = map_.bundle(frames)
     doubted = map_.anchor._replace(
         turn_sigma=config.given_caution * map_.anchor.turn_sigma,
@@ -162,6 +162,46 @@ def track_matches(
         map_.anchor.turn_sigma,
         map_.anchor.shift_sigma,
     )
+
+
+def _fused(map_: ObjectMap, config: TrackerConfig) -> BundleConfig:
+    """Adjust everything with the given poses, in place; what was believed of sightings in the end.
+
+    Where few points lead across, tracks may bend and be sure of it. Given poses err, too, but not for many
+    frames by more than they ever do: then sightings are believed less, until both agree. The weakest links
+    give way first.
+    """
+    assert map_.anchor is not None
+    everything = np.ones(len(map_.posed), dtype=bool)
+    caution, scales = config.caution, config.map.bundle
+    while True:
+        # What lasts is no outlier of the given poses.
+        believed = replace(
+            scales,
+            pixel_sigma=caution * scales.pixel_sigma,
+            anchor_outlier=caution / config.caution * scales.anchor_outlier,
+            iterations=30,
+        )
+        map_.adjust(np.arange(len(everything)), everything, believed)
+        bent = sustained_departure(map_.rotations, map_.anchor) > config.most_departure
+        if not bent or caution >= config.most_caution:
+            return believed
+        caution *= 2.0
+
+
+def sustained_departure(rotations: np.ndarray, anchor: Anchor) -> float:
+    """By how many of their standard deviations turns [T, 3, 3] leave the anchor's for some time, at most.
+
+    Medians over windows of frames, after the one turn of the object's frame that suits most.
+    """
+    use = np.flatnonzero(anchor.trust > 0.5)
+    if len(use) < _WINDOW:
+        return 0.0
+    between = rotations[use].transpose(0, 2, 1) @ anchor.rotations[use]
+    usual = robust_mean_rotation(torch.from_numpy(between)).numpy()
+    turns = Rotation.from_matrix(between @ usual.T).as_rotvec()
+    windows = np.lib.stride_tricks.sliding_window_view(turns, _WINDOW, axis=0)
+    return float(np.linalg.norm(np.median(windows, axis=-1), axis=1).max() / anchor.turn_sigma)
 
 
 def pairs_to_match(given: GivenPoses, config: TrackerConfig) -> list[tuple[int, int]]:
@@ -310,6 +350,8 @@ def measured_anchor(map_: ObjectMap, anchor: Anchor, config: TrackerConfig) -> A
     )
 
 
+# Frames over which a departure is sustained.
+_WINDOW = 9
 # Fewer rays than this always meet nearly enough.
 _LEAST_RAYS = 4
 # Fewer frames than this do not measure an error.

@@ -12,7 +12,14 @@ from turning_object import K, TurningObject, rotation_errors, turning_object
 
 from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust, pose_covariances
 from bigs.motion.features import NOTHING
-from bigs.motion.tracker import GivenPoses, TrackerConfig, contradicted_frames, pairs_to_match, track_matches
+from bigs.motion.tracker import (
+    GivenPoses,
+    TrackerConfig,
+    contradicted_frames,
+    pairs_to_match,
+    sustained_departure,
+    track_matches,
+)
 
 FRAMES = 20
 CONFIG = TrackerConfig()
@@ -164,3 +171,21 @@ def test_an_anchor_holds_what_no_sighting_tells(little: Bundle) -> None:
         start, K, BundleConfig(iterations=60, tolerance=1e-12), anchor=anchor._replace(rotations=wrong)
     )
     assert rotation_errors(found.rotations, little.rotations).max() < 1.0
+
+
+def test_only_what_lasts_is_a_sustained_departure() -> None:
+    rng = np.random.default_rng(2)
+    rotations = Rotation.from_rotvec(np.linspace(0, 3, 60)[:, None] * [0.0, 1.0, 0.1]).as_matrix()
+    sigma = np.radians(1.0)
+    noise = sigma * rng.standard_normal((60, 3))
+    noise[::10] += 0.5
+    anchor = Anchor(
+        Rotation.from_rotvec(noise).as_matrix() @ rotations, np.zeros((60, 3)), np.ones(60), sigma, np.ones(3)
+    )
+    assert sustained_departure(rotations, anchor) < 2.0
+    bent = rotations.copy()
+    bent[46:] = Rotation.from_rotvec([0.0, 0.0, 4.0 * sigma]).as_matrix() @ bent[46:]
+    assert sustained_departure(bent, anchor) == pytest.approx(4.0, abs=1.0)
+    # Frames without a given pose depart from nothing.
+    trust = np.where(np.arange(60) < 46, 1.0, 0.0)
+    assert sustained_departure(bent, anchor._replace(trust=trust)) < 2.0
