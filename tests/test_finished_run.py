@@ -88,7 +88,12 @@ def test_the_configuration_can_be_run_again(finished_run: Run, tiny_clip: Path) 
 
 def test_the_log_has_every_step(finished_run: Run) -> None:
     events = [json.loads(line) for line in (finished_run.folder / "log.jsonl").read_text().splitlines()]
+    skipped = {e["text"].split(":")[0] for e in events if e["event"] == "skipped"}
+    # The hands of this clip never let go, so nothing is to be done between grasps.
+    assert skipped & {stage.name for stage in UNGUIDED} <= {"regrasp", "object-completion"}
     for index, stage in enumerate(UNGUIDED):
+        if stage.name in skipped:
+            continue
         assert {"event": "stage", "stage": stage.name, "index": index, "stages": len(UNGUIDED)} in events
         steps = [e for e in events if e["event"] == "step" and e["stage"] == stage.name]
         expected = stage.steps if isinstance(stage, OptimizeStage) else 0

@@ -137,8 +137,9 @@ RANGES: dict[type, dict[str, Range]] = {
         "image_size": Range(16, 1 << 12),
         "t_first": _SHARE,
         "t_last": _SHARE,
-        "enough": _SHARE,
-        "well_seen": _SHARE,
+        # More than all is never seen: then nothing is skipped.
+        "enough": Range(0.0, 10.0),
+        "well_seen": Range(0.0, 10.0),
     },
 }
 

@@ -193,7 +193,7 @@ def test_broken_networks(
     ("content", "words"),
     [
         (None, ["gt.npz: ", "expected ground truth", "found no such file"]),
-        (b"PK\x03\x04", ["gt.npz: ", "expected an .npz", "found"]),
+        (b"PK\x03\x04", ["gt.npz: ", "expected ground truth, an .npz", "found"]),
     ],
 )
 def test_broken_ground_truth(
@@ -246,7 +246,7 @@ def test_out_is_below_a_file(call: Callable[..., Answer], tiny_clip: Path, tmp_p
 def test_the_demo_does_not_overwrite(call: Callable[..., Answer], tmp_path: Path) -> None:
     (tmp_path / "demo" / "run").mkdir(parents=True)
     answer = call("demo", "--out", tmp_path / "demo", "--preset", "smoke")
-    assert_refused(answer, "run: ", "expected an empty place", "found an earlier one")
+    assert_refused(answer, "demo: ", "expected a new or empty folder", "remove it")
     assert [path.name for path in (tmp_path / "demo").iterdir()] == ["run"]
 
 
@@ -301,7 +301,7 @@ def test_resuming_something_else_leaves_the_run_alone(
     answer = call(
         "reconstruct", tiny_clip, "--out", run_copy, "--preset", "smoke", "--set=seed=5", "--resume"
     )
-    assert_refused(answer, "latest.safetensors: ", "expected a checkpoint of this clip", "found")
+    assert_refused(answer, "--set seed: expected 0, as the run has it", "found 5")
     assert contents(run_copy) == before
 
 

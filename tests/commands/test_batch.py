@@ -221,7 +221,7 @@ def test_threads_are_shared_out(
         ("--slurm a=b", ["--slurm", "--engine slurm", "found processes"]),
         ("--slurm-cluster local", ["--slurm-cluster", "--engine slurm", "found processes"]),
         ("--engine slurm --slurm partition", ["--slurm partition", "expected name=value"]),
-        ("--set nothing=1", ["--set nothing=1", "no setting 'nothing'"]),
+        ("--set nothing=1", ["--set nothing=1", "found 'nothing'"]),
         ("--engine slurm", ["--engine slurm", "expected a cluster"]),
     ],
 )

@@ -116,7 +116,7 @@ def test_runs_are_scored_on_the_clip_as_it_is(
     def fake(run: Path, plan: EvaluationPlan, listen: object) -> Evaluation:
         asked.append(plan)
         worse = {"swapped": {"mpjpe_ra_r": 27.0}, "clean": {}}.get(run.name, {"cd_icp_sq": 0.75})
-        return Evaluation("clip", {"result": SCORES | worse}, {}, ())
+        return Evaluation("clip", {"result": SCORES | worse}, {}, (), {})
 
     monkeypatch.setattr(module, "evaluate_run", fake)
     runs.fail = "jpeg"
