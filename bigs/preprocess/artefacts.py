@@ -40,6 +40,9 @@ HANDS_FILE = "hands.npz"
 SFM_FILE = "object_sfm.npz"
 ALIGNED_FILE = "aligned.npz"
 
+# No picture has more on a side.
+_MOST_PIXELS = 1 << 16
+
 State = Literal["missing", "current", "outdated", "supplied"]
 
 
@@ -140,7 +143,7 @@ def read_frame_set(processed: Path) -> FrameSet:
         raise InputError(f"{file}: names: expected a list of frame names, found {shown(names)}")
     for name in names:
         check_name(f"{file}: names", name)
-    size = {key: _number(file, stored, key) for key in ("width", "height", "fps")}
+    size = {key: _pixels(file, stored, key) for key in ("width", "height")}
     K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise InputError(f"{file}: K: expected positive focal lengths over (0, 0, 1), found {K.tolist()}")
@@ -155,9 +158,9 @@ def read_frame_set(processed: Path) -> FrameSet:
     source_width, source_height = source["source_size"].tolist()
     return FrameSet(
         names=tuple(names),
-        fps=size["fps"],
-        width=int(size["width"]),
-        height=int(size["height"]),
+        fps=_number(file, stored, "fps"),
+        width=size["width"],
+        height=size["height"],
         K=K,
         camera=str(stored.get("camera", "supplied")),
         focal_known=bool(stored.get("focal_known", True)),
@@ -374,6 +377,14 @@ def _counts(where: str, value: Any, shape: Sequence[int | str]) -> np.ndarray:
     if (counts < 0).any() or (counts != np.floor(counts)).any():
         raise InputError(f"{where}: expected whole numbers of 0 or more, found {shown(value)}")
     return counts.astype(int)
+
+
+def _pixels(file: Path, stored: Mapping[str, Any], key: str) -> int:
+    where = f"{file}: {key}"
+    count = int(_counts(where, require(where, stored, key), ()))
+    if not 1 <= count <= _MOST_PIXELS:
+        raise InputError(f"{where}: expected 1 to {_MOST_PIXELS} pixels, found {count}")
+    return count
 
 
 def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:

@@ -186,6 +186,9 @@ def test_damaged_files_are_refused_in_a_sentence(tmp_path: Path) -> None:
         ("source_length", "many"),
         ("source_length", -1),
         ("width", [1]),
+        ("width", 0.5),
+        ("height", 0),
+        ("height", 1e6),
         ("fps", float("nan")),
     ],
 )
