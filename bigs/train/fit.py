@@ -98,7 +98,7 @@ def fit(
     watch.begin("start values")
     unknown = unknown_occluders(clip)
     motion = None
-    if isinstance(config.stages[0], ObjectMotionStage):
+    if config.stages and isinstance(config.stages[0], ObjectMotionStage):
         watch.begin(config.stages[0].name)
         motion = _object_motion(clip, config, config.stages[0], checkpoints, report, listen)
         watch.begin("start values")
