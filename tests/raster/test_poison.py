@@ -91,5 +91,5 @@ def test_a_gradient_beyond_the_numbers_is_none():
 @pytest.mark.parametrize("size", [(65_537, 1), (1, 65_537), (2**40, 2**40), (20_000, 20_000)])
 def test_images_beyond_reason_are_refused(size):
     inputs = scene(n=3)
-    with pytest.raises(InputError, match="65536 pixels a side|at most 2147483648 values"):
+    with pytest.raises(InputError, match=r"65536 pixels a side|at most 2147483648 values"):
         rasterization(**{**inputs, "width": size[0], "height": size[1]})
