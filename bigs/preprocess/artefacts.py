@@ -156,6 +156,15 @@ def read_frame_set(processed: Path) -> FrameSet:
         )
     }
     source_width, source_height = source["source_size"].tolist()
+    places, length = source["source_frames"], int(source["source_length"])
+    if len(places) not in (0, len(names)) or (length not in (0, len(names)) and not len(places)):
+        raise InputError(
+            f"{file}: source_frames: expected one for each of {len(names)} names, found {len(places)}"
+        )
+    if length and len(places) and places.max() >= length:
+        raise InputError(
+            f"{file}: source_frames: expected numbers below the source's {length}, found {places.max()}"
+        )
     return FrameSet(
         names=tuple(names),
         fps=_number(file, stored, "fps"),
@@ -164,8 +173,8 @@ def read_frame_set(processed: Path) -> FrameSet:
         K=K,
         camera=str(stored.get("camera", "supplied")),
         focal_known=bool(stored.get("focal_known", True)),
-        source_frames=tuple(source["source_frames"].tolist()),
-        source_length=int(source["source_length"]),
+        source_frames=tuple(places.tolist()),
+        source_length=length,
         source_size=(source_width, source_height),
     )
 

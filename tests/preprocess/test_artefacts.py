@@ -200,6 +200,16 @@ def test_every_field_of_the_frames_is_checked(tmp_path: Path, field: str, value:
         read_frame_set(tmp_path)
 
 
+def test_the_sources_frames_are_those_of_the_names(tmp_path: Path) -> None:
+    for places, length in (((0,), 9), ((), 9), ((3, 9), 9), ((0, 1, 2), 0)):
+        write_frame_set(tmp_path, replace(FRAME_SET, source_frames=places, source_length=length), "")
+        with pytest.raises(InputError, match=r"frames.json: source_frames: expected"):
+            read_frame_set(tmp_path)
+    for places, length in (((), 0), ((), 2), ((3, 8), 9), ((3, 8), 0)):
+        write_frame_set(tmp_path, replace(FRAME_SET, source_frames=places, source_length=length), "")
+        assert read_frame_set(tmp_path).source_frames == places
+
+
 @pytest.mark.parametrize("version", [None, [1], "one", 10**90])
 def test_a_version_that_is_none_is_out_of_date(tmp_path: Path, version: object) -> None:
     file = tmp_path / "masks.json"
