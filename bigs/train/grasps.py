@@ -28,6 +28,8 @@ from bigs.types import Side
 
 # The joints that tell where a hand is: the wrist, the knuckles and the fingers' ends.
 _JOINTS = (0, 1, 4, 7, 10, 13, 16, 17, 18, 19, 20)
+# However wrong a depth is, a hand that holds the object is within this of its surface, metres.
+_ARM = 0.3
 # A picture says more than an estimate: in the second cut a frame pays by both, half for the estimate.
 _ESTIMATE_SHARE = 0.5
 
@@ -110,8 +112,19 @@ def _search(
     poses, carrier = at.hand(side), at.object
     points, information = _in_object_frame(scene, side, stage)
     touches = touching.numpy()
+    reach = float(carrier.scale * scene.object_surface.verts.norm(dim=1).max()) + _ARM
+
+    def reached(stretches: list[range]) -> list[range]:
+        """Those in which the hand is near the object; its outline may meet the object's metres away."""
+        places = [_place(points[s], information[s]) for s in stretches]
+        return [
+            s
+            for s, place in zip(stretches, places, strict=True)
+            if np.linalg.norm(place, axis=1).min() < reach
+        ]
+
     prices = Prices(stage.free, stage.grasp, stage.least, stage.gap)
-    proposed = grasps_by_estimates(points, information, touches, prices)
+    proposed = reached(grasps_by_estimates(points, information, touches, prices))
     stretches = [Stretch(frames, h) for h, frames in enumerate(proposed)]
     costs = _estimate_costs(points, information, proposed)
     if mismatch is not None:
@@ -119,7 +132,7 @@ def _search(
         usual = float(mismatch(side, poses).nanquantile(0.25))
         apart = prices.free * ~touches
         for _ in range(stage.rounds):
-            hypotheses = _hypotheses([s.frames for s in stretches], scene.n_frames, stage.least)
+            hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, stage.least))
             pictures = np.stack(
                 [_excess(mismatch, side, poses, carrier, h, usual) for h in hypotheses]
                 or [np.zeros((0, scene.n_frames))]

@@ -138,6 +138,16 @@ def test_pictures_drop_a_grasp_that_they_contradict() -> None:
     assert found["left"].stretches == [] and found["right"].stretches == [range(0, FRAMES)]
 
 
+def test_a_hand_metres_away_holds_nothing() -> None:
+    """Carried through a turn it could end behind the camera."""
+    scene = turning_scene()
+    with torch.no_grad():
+        far = scene.at(ALL).hand("right").wrist + torch.tensor([0.0, 0.0, 30.0])
+        scene.hand_poses["right"].position.restart(far)
+    found = find_grasps(scene, STAGE, EVERYWHERE)
+    assert found["right"].stretches == [] and found["left"].stretches == [range(0, FRAMES)]
+
+
 def test_gradients_of_a_held_hand_reach_grasp_and_object() -> None:
     scene = turning_scene()
     find_grasps(scene, STAGE, EVERYWHERE)
