@@ -17,7 +17,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from bigs.checks import InputError
-from bigs.commands.view import view
+from bigs.commands.render.live import view
 
 OUT = Path(__file__).with_name("viewer.png")
 # WebGL without a graphics card.

@@ -26,18 +26,24 @@ import tyro
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.commands.clips import open_clip
-from bigs.commands.reconstruct import reconstruct
-from bigs.commands.rendering import orbit_camera, render_frame
-from bigs.commands.run_folder import load_run
+from bigs.commands.clips.open import open_clip
+from bigs.commands.folder.contents import load_run
+from bigs.commands.render.frame import orbit_camera, render_frame
+from bigs.commands.run.reconstruct import reconstruct
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt, to_and_fro
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel, load_hand_models, mirror_points
 from bigs.models.playback import HandPlayback, Playback
 from bigs.models.repose import repose
-from bigs.train.initial import InitialConfig, hand_in_camera, object_in_camera, smooth_hand, smooth_object
-from bigs.train.presets import PRESETS
+from bigs.train.plan.presets import PRESETS
+from bigs.train.start.initial import (
+    InitialConfig,
+    hand_in_camera,
+    object_in_camera,
+    smooth_hand,
+    smooth_object,
+)
 from bigs.types import Side
 
 SHOWN = 5

@@ -23,11 +23,11 @@ from typing import Literal
 import tyro
 
 from bigs.checks import InputError
-from bigs.commands.evaluation import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
-from bigs.commands.preprocess import preprocess
-from bigs.commands.preprocess_request import PreprocessRequest
-from bigs.commands.reconstruct import reconstruct
-from bigs.commands.submission import submit
+from bigs.commands.evaluate.runs import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.export.submission import submit
+from bigs.commands.preprocess.all_steps import preprocess
+from bigs.commands.preprocess.request import PreprocessRequest
+from bigs.commands.run.reconstruct import reconstruct
 from bigs.data.arctic import find_arctic, read_arctic
 from bigs.data.ground_truth import load_annotation
 from bigs.data.hold import load_hold
@@ -36,9 +36,9 @@ from bigs.data.synthetic import make_clip
 from bigs.data.writers import write_arctic
 from bigs.export.submission import TEST_SEQUENCES
 from bigs.hand import load_hand_models
-from bigs.preprocess.camera import CameraRequest
-from bigs.preprocess.frames import FrameConfig
-from bigs.train.presets import PRESETS
+from bigs.preprocess.frames.camera import CameraRequest
+from bigs.preprocess.frames.extract import FrameConfig
+from bigs.train.plan.presets import PRESETS
 
 STAND_IN = "arctic_s99_bottle_grab_01_1"
 

@@ -23,9 +23,9 @@ import torch
 import tyro
 
 from bigs.checks import InputError
-from bigs.commands.convert import ConvertPlan, convert
-from bigs.commands.evaluation import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
-from bigs.commands.reconstruct import reconstruct
+from bigs.commands.clips.convert import ConvertPlan, convert
+from bigs.commands.evaluate.runs import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
+from bigs.commands.run.reconstruct import reconstruct
 from bigs.data.ground_truth import load_annotation
 from bigs.data.ho3d import CV_FROM_GL
 from bigs.data.hold import load_hold
@@ -33,7 +33,7 @@ from bigs.data.moving import in_world
 from bigs.data.synthetic import make_clip
 from bigs.data.writers import write_ho3d
 from bigs.hand import load_hand_models
-from bigs.train.presets import PRESETS
+from bigs.train.plan.presets import PRESETS
 
 STAND_IN = "SYN1"
 

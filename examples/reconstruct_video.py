@@ -23,17 +23,17 @@ import numpy as np
 import tyro
 
 from bigs.checks import InputError
-from bigs.commands.evaluation import EvaluationPlan, evaluate_run
-from bigs.commands.preprocess import preprocess
-from bigs.commands.preprocess_request import PreprocessRequest
-from bigs.commands.reconstruct import reconstruct
+from bigs.commands.evaluate.runs import EvaluationPlan, evaluate_run
+from bigs.commands.preprocess.all_steps import preprocess
+from bigs.commands.preprocess.request import PreprocessRequest
+from bigs.commands.run.reconstruct import reconstruct
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import load_hand_models
-from bigs.preprocess.camera import CameraRequest
-from bigs.preprocess.frames import FrameConfig
-from bigs.train.presets import PRESETS
+from bigs.preprocess.frames.camera import CameraRequest
+from bigs.preprocess.frames.extract import FrameConfig
+from bigs.train.plan.presets import PRESETS
 
 # Pixels by which the made keypoints err.
 NOISE = 1.0

@@ -24,7 +24,7 @@ import trimesh
 import tyro
 from rich.console import Console
 
-from bigs.commands.prior_train import Shape, cover, read_shape, train_prior
+from bigs.commands.prior.train import Shape, cover, read_shape, train_prior
 from bigs.commands.progress import steps_listener
 from bigs.commands.spoken import spoken
 from bigs.geometry.mesh import frames_from_normals, sample_surface, vertex_normals
@@ -37,8 +37,8 @@ from bigs.guidance.pixel_training import PixelTrainingConfig
 from bigs.metrics.shape import ShapeScore, shape_score
 from bigs.models.object_detail import split_object
 from bigs.raster.settings import RasterSettings
-from bigs.train.config import GuidanceStage
-from bigs.train.guided import coverage_of, follow, guide_object
+from bigs.train.plan.config import GuidanceStage
+from bigs.train.unseen.guided import coverage_of, follow, guide_object
 
 # Seeds of the objects to learn from begin at 0, those of the others here.
 HELD_OUT = 10_000

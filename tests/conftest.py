@@ -75,7 +75,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_clip: Path) -> R
 def runs(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     """Series of runs without runs."""
     fake = FakeRuns()
-    monkeypatch.setattr("bigs.commands.series.reconstruct", fake)
+    monkeypatch.setattr("bigs.commands.run.series.reconstruct", fake)
     return fake
 
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bigs.commands.reconstruct import run_origin
-from bigs.commands.run_folder import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
-from bigs.train.config import RunConfig
-from bigs.train.config_file import save_config
+from bigs.commands.folder.contents import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
+from bigs.commands.run.reconstruct import run_origin
+from bigs.train.plan.config import RunConfig
+from bigs.train.plan.config_file import save_config
 from bigs.train.switches import SWITCHES, without
 
 SCORES = {

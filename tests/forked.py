@@ -104,7 +104,7 @@ def _child(order: dict[str, Any]) -> int:
 def _serve() -> None:
     import bigs.cli
     import bigs.commands.progress
-    import bigs.commands.reconstruct  # noqa: F401
+    import bigs.commands.run.reconstruct  # noqa: F401
 
     with contextlib.suppress(ImportError):
         import av  # noqa: F401

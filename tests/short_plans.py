@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
-from bigs.train.config import OptimizeStage, RunConfig
+from bigs.train.plan.config import OptimizeStage, RunConfig
 
 
 def short(config: RunConfig, steps: int = 2, image_size: int | None = None) -> RunConfig:

@@ -14,8 +14,8 @@ import torch
 from command_line import Run
 
 from bigs.checks import InputError
-from bigs.commands.rendering import render_depth, render_frame
-from bigs.commands.run_folder import load_run
+from bigs.commands.folder.contents import load_run
+from bigs.commands.render.frame import render_depth, render_frame
 from bigs.data.base import Clip
 from bigs.data.moving import move_hand, move_object
 from bigs.hand import load_hand_models
@@ -30,18 +30,18 @@ PAGE = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
 
 # Those that take files, folders, names or configurations, but no array: other tests give them bad ones.
 OF_FILES = {
-    "bigs.commands.reconstruct.reconstruct",
-    "bigs.commands.preprocess.preprocess",
-    "bigs.commands.convert.convert",
-    "bigs.commands.evaluation.evaluate_run",
-    "bigs.commands.truth.load_truth",
-    "bigs.commands.views.render_run",
+    "bigs.commands.run.reconstruct.reconstruct",
+    "bigs.commands.preprocess.all_steps.preprocess",
+    "bigs.commands.clips.convert.convert",
+    "bigs.commands.evaluate.runs.evaluate_run",
+    "bigs.commands.clips.truth.load_truth",
+    "bigs.commands.render.views.render_run",
     "bigs.data.load_clip",
     "bigs.data.load_hold",
     "bigs.data.write_hold",
     "bigs.data.synthetic.make_clip",
     "bigs.export.submission.write_submission",
-    "bigs.train.config_file.with_changes",
+    "bigs.train.plan.config_file.with_changes",
     "bigs.train.fit.fit",
     "bigs.train.switches.without_all",
 }
@@ -96,12 +96,12 @@ WRONG: dict[str, list[tuple[Call, str]]] = {
     "right.rest_vertices": [(lambda t: t.right.rest_vertices(torch.zeros(3)), r"betas: .*found \[3\]")],
     "right.rest_joints": [(lambda t: t.right.rest_joints(torch.zeros(())), r"betas: .*found \[\]")],
     "playback.gaussians": [(lambda t: t.playback.gaussians([0, 12]), "frames: .* 0 to 11, found 12")],
-    "bigs.commands.rendering.render_frame": [
+    "bigs.commands.render.frame.render_frame": [
         (lambda t: render_frame(t.playback, 0, torch.eye(3), torch.eye(3), 4, 4), r"viewmat: .*\[4, 4\]"),
         (lambda t: render_frame(t.playback, 0, torch.eye(4), torch.eye(4), 4, 4), r"K: .*\[3, 3\]"),
         (lambda t: render_frame(t.playback, -1, torch.eye(4), torch.eye(3), 4, 4), "frames: .*found -1"),
     ],
-    "bigs.commands.rendering.render_depth": [
+    "bigs.commands.render.frame.render_depth": [
         (lambda t: render_depth(t.playback, 0, torch.eye(3), torch.eye(3), 4, 4), r"viewmat: .*\[4, 4\]"),
         (lambda t: render_depth(t.playback, 0, torch.eye(4), torch.eye(4), 4, 4), r"K: .*\[3, 3\]"),
     ],

@@ -15,10 +15,10 @@ from fake_runs import idle_switch
 
 import bigs
 from bigs.checks import InputError
-from bigs.commands.reconstruct import Outcome
-from bigs.train.config import RunConfig
+from bigs.commands.run.reconstruct import Outcome
 from bigs.train.fit import FitReport
-from bigs.train.presets import PRESETS
+from bigs.train.plan.config import RunConfig
+from bigs.train.plan.presets import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_ingredients_are_left_out(
         given.append(config)
         return Outcome(out, [("score", "unit", "result")], FitReport(), 0.0)
 
-    monkeypatch.setattr("bigs.commands.reconstruct.reconstruct", run)
+    monkeypatch.setattr("bigs.commands.run.reconstruct.reconstruct", run)
     idle = idle_switch(PRESETS["fast"])
     options = ["--preset", "fast", "--set", "seed=3", "--without", "share", "--without", idle]
     answer = call("reconstruct", tmp_path, "--out", tmp_path / "out", *options)
@@ -204,7 +204,7 @@ def test_other_ends_are_one_line_too(
     def fail(*_: Any, **__: Any) -> None:
         raise error
 
-    monkeypatch.setattr("bigs.commands.run_folder.load_run", fail)
+    monkeypatch.setattr("bigs.commands.folder.contents.load_run", fail)
     answer = call("export", tmp_path, "--format", "ply")
     assert_refused(answer, *words)
     assert code is None or answer.code == code

@@ -21,11 +21,11 @@ from command_line import Run
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.commands.run_folder import load_run
+from bigs.commands.folder.contents import load_run
 from bigs.data.hold import load_hold
 from bigs.export.submission import check_submission
 from bigs.hand import load_hand_models
-from bigs.train.initial import initial_trajectory
+from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

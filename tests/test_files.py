@@ -19,15 +19,15 @@ import pytest
 from bigs import archives
 from bigs.archives import MAX_MEMBERS, read_npz
 from bigs.checks import InputError, shown
-from bigs.commands.manifest import read_manifest
+from bigs.commands.batch.manifest import read_manifest
 from bigs.data.transforms import read_cameras
 from bigs.export.ply import load_splats
 from bigs.export.poses import load_poses
 from bigs.files import MAX_DEPTH, MAX_YAML_BYTES, MAX_YAML_NODES, open_regular, read_json, read_yaml
 from bigs.hand.io import load_hand_model
 from bigs.models.playback_file import load_playback
-from bigs.train.config_file import load_config, with_changes
-from bigs.train.presets import PRESETS
+from bigs.train.plan.config_file import load_config, with_changes
+from bigs.train.plan.presets import PRESETS
 from bigs.unpickle import load_npy
 from bigs.weights import load_weights
 

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
-from bigs.train.config import CompletionStage, GuidanceStage, OptimizeStage
-from bigs.train.presets import PRESETS
+from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage
+from bigs.train.plan.presets import PRESETS
 from bigs.types import ENTITIES, Side
 
 pytestmark = pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
 from command_line import contents
 from forked import KILLED, Death, Nursery
 
-from bigs.commands.run_lock import only_writer
+from bigs.commands.folder.lock import only_writer
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.types import Side

@@ -19,12 +19,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from bigs.checks import InputError
-from bigs.commands.batch_job import Job, read_status, run_job
-from bigs.commands.formats import write_format
-from bigs.commands.manifest import read_manifest
-from bigs.commands.run_folder import SCENE, load_run
-from bigs.commands.series import PlannedRun
-from bigs.commands.view import view
+from bigs.commands.batch.job import Job, read_status, run_job
+from bigs.commands.batch.manifest import read_manifest
+from bigs.commands.export.formats import write_format
+from bigs.commands.folder.contents import SCENE, load_run
+from bigs.commands.render.live import view
+from bigs.commands.run.series import PlannedRun
 from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import Clip
 from bigs.data.ho3d import load_ho3d
@@ -34,7 +34,7 @@ from bigs.data.writers import write_arctic, write_ho3d, write_nerfstudio
 from bigs.export.challenge import load_challenge
 from bigs.export.submission import check_submission
 from bigs.names import MAX_NAME_BYTES, check_inside, check_name, check_path
-from bigs.train.presets import PRESETS
+from bigs.train.plan.presets import PRESETS
 from bigs.unpickle import load_npy
 
 HOSTILE = {

@@ -13,8 +13,8 @@ from PIL import Image
 from safetensors.numpy import load_file
 from short_plans import short
 
-from bigs.commands.reconstruct import reconstruct
-from bigs.train.presets import SMOKE
+from bigs.commands.run.reconstruct import reconstruct
+from bigs.train.plan.presets import SMOKE
 from bigs.types import MASK_VALUES
 from bigs.unpickle import load_npy
 

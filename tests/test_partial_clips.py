@@ -12,8 +12,8 @@ from PIL import Image
 from safetensors.numpy import load_file
 from short_plans import short
 
-from bigs.commands.reconstruct import reconstruct
-from bigs.train.presets import PRESETS
+from bigs.commands.run.reconstruct import reconstruct
+from bigs.train.plan.presets import PRESETS
 from bigs.types import ENTITIES, MASK_VALUES
 from bigs.unpickle import load_npy
 

@@ -15,9 +15,9 @@ from safetensors.numpy import load_file
 from short_plans import short
 from small_vgg import torchvision_state
 
-from bigs.commands.reconstruct import reconstruct
-from bigs.train.config import CompletionStage, GuidanceStage, OptimizeStage
-from bigs.train.presets import PRESETS
+from bigs.commands.run.reconstruct import reconstruct
+from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage
+from bigs.train.plan.presets import PRESETS
 
 pytestmark = pytest.mark.slow
 

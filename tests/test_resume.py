@@ -21,10 +21,10 @@ from family import Family
 from safetensors.numpy import load_file
 
 from bigs.checks import InputError
-from bigs.commands.reconstruct import reconstruct, run_origin
-from bigs.commands.same_options import check_same_options
-from bigs.train.config_file import save_config
-from bigs.train.presets import PRESETS
+from bigs.commands.folder.options import check_same_options
+from bigs.commands.run.reconstruct import reconstruct, run_origin
+from bigs.train.plan.config_file import save_config
+from bigs.train.plan.presets import PRESETS
 
 pytestmark = pytest.mark.slow
 

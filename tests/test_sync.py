@@ -10,9 +10,9 @@ from pathlib import Path
 
 import bigs
 from bigs.cli import main, runs, terminal
-from bigs.commands import views
-from bigs.commands.formats import FORMATS
-from bigs.train.presets import PRESETS
+from bigs.commands.export.formats import FORMATS
+from bigs.commands.render import views
+from bigs.train.plan.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 

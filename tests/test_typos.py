@@ -102,9 +102,9 @@ def test_a_slip_in_a_sub_command_is_no_source(call: Callable[..., Answer]) -> No
     ],
 )
 def test_settings_that_are_nearly_right(change: str, words: str) -> None:
-    from bigs.train.config_file import with_changes
-    from bigs.train.plan import check_plan
-    from bigs.train.presets import PRESETS
+    from bigs.train.check_plan import check_plan
+    from bigs.train.plan.config_file import with_changes
+    from bigs.train.plan.presets import PRESETS
 
     with pytest.raises(InputError, match=words):
         check_plan(with_changes(PRESETS["full"], [change]))

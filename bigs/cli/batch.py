@@ -11,9 +11,9 @@ from bigs.checks import InputError, check_choice
 from bigs.cli.terminal import Preset, fail_for, print_table, say, settings_of, telling
 
 if TYPE_CHECKING:
-    from bigs.commands.engines import Engine
-    from bigs.commands.manifest import Entry
-    from bigs.train.config import RunConfig
+    from bigs.commands.batch.engines import Engine
+    from bigs.commands.batch.manifest import Entry
+    from bigs.train.plan.config import RunConfig
 
 EngineName = Literal["processes", "slurm", "ray"]
 
@@ -50,9 +50,9 @@ def batch(
         slurm: an option of submitit, as name=value (slurm_partition=cpu, timeout_min=120); repeatable.
         slurm_cluster: local runs submitit's jobs as processes of this machine, to try it out.
     """
-    from bigs.commands.batch import BatchPlan, plan_batch, run_batch, share_threads
-    from bigs.commands.manifest import read_manifest
-    from bigs.train.presets import PRESETS
+    from bigs.commands.batch.manifest import read_manifest
+    from bigs.commands.batch.run_batch import BatchPlan, plan_batch, run_batch, share_threads
+    from bigs.train.plan.presets import PRESETS
     from bigs.train.switches import without_all
 
     if retries < 0:
@@ -84,7 +84,7 @@ def batch(
     options = dict(map(_option, slurm))
 
     def start() -> Engine:
-        from bigs.commands.engines import Processes, RayCluster, SlurmJobs
+        from bigs.commands.batch.engines import Processes, RayCluster, SlurmJobs
 
         if engine == "slurm":
             return SlurmJobs(out / "slurm", threads, options, slurm_cluster)

@@ -40,7 +40,7 @@ def bench_engine(
         scale: of the number of Gaussians and of pixels; 0.01 takes seconds.
         seed: of the workloads.
     """
-    from bigs.commands.bench import bench_engine as run
+    from bigs.commands.bench.engine import bench_engine as run
 
     with telling() as tell:
         tables = run(
@@ -87,8 +87,8 @@ def bench_reconstruct(
     """
     use_threads(threads)
     from bigs.bench.run_tables import BRIEF
-    from bigs.commands.bench_reconstruct import RunPlan
-    from bigs.commands.bench_reconstruct import bench_reconstruct as run
+    from bigs.commands.bench.reconstruct import RunPlan
+    from bigs.commands.bench.reconstruct import bench_reconstruct as run
 
     plan = RunPlan(clips, presets, without, steps_limit, hand_model, frames, growth_steps)
     with telling() as tell:
@@ -116,9 +116,9 @@ def bench_preprocess(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.bench_preprocess import PreprocessPlan
-    from bigs.commands.bench_preprocess import bench_preprocess as run
-    from bigs.commands.preprocess_variants import VARIANTS
+    from bigs.commands.bench.preprocess import PreprocessPlan
+    from bigs.commands.bench.preprocess import bench_preprocess as run
+    from bigs.commands.bench.variants import VARIANTS
 
     plan = PreprocessPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
     with telling() as tell:
@@ -148,9 +148,9 @@ def bench_robustness(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.bench_robustness import RobustnessPlan
-    from bigs.commands.bench_robustness import bench_robustness as run
-    from bigs.commands.clip_damage import DAMAGES
+    from bigs.commands.bench.clip_damage import DAMAGES
+    from bigs.commands.bench.robustness import RobustnessPlan
+    from bigs.commands.bench.robustness import bench_robustness as run
 
     plan = RobustnessPlan(clips, damages or tuple(DAMAGES), preset, hand_model, seed)
     with telling() as tell:
@@ -180,8 +180,8 @@ def bench_adjustment(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.bench_adjustment import AdjustmentPlan
-    from bigs.commands.bench_adjustment import bench_adjustment as run
+    from bigs.commands.bench.adjustment import AdjustmentPlan
+    from bigs.commands.bench.adjustment import bench_adjustment as run
 
     plan = AdjustmentPlan(frames, points, seen, iterations, seed)
     with telling() as tell:
@@ -209,8 +209,8 @@ def bench_motion(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.bench_motion import VARIANTS, MotionPlan
-    from bigs.commands.bench_motion import bench_motion as run
+    from bigs.commands.bench.motion import VARIANTS, MotionPlan
+    from bigs.commands.bench.motion import bench_motion as run
 
     plan = MotionPlan(clips, variants or tuple(VARIANTS), hand_model, seed)
     with telling() as tell:

@@ -33,8 +33,8 @@ def convert(
         from_truth: start from a data set's ground truth. No fair start: for studies of what follows it.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
     """
-    from bigs.commands.convert import ConvertPlan
-    from bigs.commands.convert import convert as run
+    from bigs.commands.clips.convert import ConvertPlan
+    from bigs.commands.clips.convert import convert as run
 
     for name, text in run(clip, out, ConvertPlan(view, every, width, masks, from_truth), hand_model):
         say(f"{name:10s} {text}")

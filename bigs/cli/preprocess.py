@@ -12,7 +12,7 @@ from bigs.checks import InputError, found_at
 from bigs.cli.terminal import say, telling, use_threads
 
 if TYPE_CHECKING:
-    from bigs.commands.preprocess_request import PreprocessRequest, StepName, StepOutcome
+    from bigs.commands.preprocess.request import PreprocessRequest, StepName, StepOutcome
     from bigs.types import Entity
 
 
@@ -225,7 +225,7 @@ def build(clip: Clip, hand_model: Path | None = None, redo: bool = False) -> Non
 
 def clip_of(clip: Path, out: Path, options: VideoOptions, hand_model: Path | None) -> Path:
     """The clip that `bigs reconstruct` was given, or what it makes of a video in `out/clip` first."""
-    from bigs.preprocess.source import is_source
+    from bigs.preprocess.frames.source import is_source
 
     if not is_source(clip):
         if options.given():
@@ -242,9 +242,9 @@ def clip_of(clip: Path, out: Path, options: VideoOptions, hand_model: Path | Non
 def _request(
     clip: Path, source: Path | None, options: VideoOptions, hand_model: Path | None, redo: bool
 ) -> PreprocessRequest:
-    from bigs.commands.preprocess_request import PreprocessRequest
-    from bigs.preprocess.camera import CameraRequest
-    from bigs.preprocess.frames import FrameConfig
+    from bigs.commands.preprocess.request import PreprocessRequest
+    from bigs.preprocess.frames.camera import CameraRequest
+    from bigs.preprocess.frames.extract import FrameConfig
 
     chosen = dataclasses.asdict(options.frames)
     camera = CameraRequest(**{name: chosen.pop(name) for name in ("K", "focal", "colmap")})
@@ -282,8 +282,8 @@ def _labels(words: tuple[str, ...]) -> dict[Entity, int]:
 
 
 def _run(request: PreprocessRequest, steps: tuple[StepName, ...] | None) -> None:
-    from bigs.commands.preprocess import preprocess as run
-    from bigs.commands.preprocess_request import STEPS
+    from bigs.commands.preprocess.all_steps import preprocess as run
+    from bigs.commands.preprocess.request import STEPS
 
     with telling() as tell:
         run(request, STEPS if steps is None else steps, tell, _tell)

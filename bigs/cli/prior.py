@@ -55,7 +55,7 @@ def prior_fit(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.prior import InversionConfig, fit_token
+    from bigs.commands.prior.fit import InversionConfig, fit_token
     from bigs.commands.progress import steps_listener
 
     config = InversionConfig(object, token, steps, batch, lr, conditioning_scale, seed)
@@ -109,7 +109,7 @@ def prior_train(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.prior_train import PixelConfig, PixelTrainingConfig, train_prior
+    from bigs.commands.prior.train import PixelConfig, PixelTrainingConfig, train_prior
     from bigs.commands.progress import steps_listener
 
     config = PixelTrainingConfig(steps, batch, lr, seed, net=PixelConfig(width))

@@ -25,15 +25,15 @@ from bigs.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from bigs.commands.reconstruct import Outcome
+    from bigs.commands.run.reconstruct import Outcome
 
 # An option that is there or not, without a "--no-" of its own.
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
-# "auto", or the names of `train.config.PriorKind`; a test compares.
+# "auto", or the names of `train.plan.config.PriorKind`; a test compares.
 Prior = Literal["auto", "off", "symmetry", "trained", "sd"]
 
-# The names of `commands.formats.FORMATS`; a test compares.
+# The names of `commands.export.formats.FORMATS`; a test compares.
 Format = Literal[
     "ply",
     "spz",
@@ -50,7 +50,7 @@ Format = Literal[
 ]
 
 
-# Likewise of `commands.views`.
+# Likewise of `commands.render.views`.
 World = Literal["camera", "object"]
 About = Literal["object", "scene"]
 DepthFormat = Literal["png", "npy"]
@@ -76,8 +76,8 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
         seed: of the clip and of the reconstruction.
     """
     use_threads(threads)
-    from bigs.commands.demo import demo as run_demo
     from bigs.commands.progress import progress_listener
+    from bigs.commands.run.demo import demo as run_demo
 
     config = settings_of(preset, None, (f"seed={seed}",))
     with progress_listener(stderr, config) as listen:
@@ -94,7 +94,7 @@ def info(clip: ClipPath, hand_model: Path | None = None) -> None:
             with hands.npz.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
     """
-    from bigs.commands.inspect import describe_clip
+    from bigs.commands.clips.inspect import describe_clip
 
     for name, text in describe_clip(clip, hand_model):
         say(f"{name:10s} {text}")
@@ -149,9 +149,9 @@ def reconstruct(
         video: what preprocessing needs, when the clip is a video or a folder of images.
     """
     use_threads(threads)
-    from bigs.commands.prior_weights import with_prior
+    from bigs.commands.prior.weights import with_prior
     from bigs.commands.progress import progress_listener
-    from bigs.commands.reconstruct import reconstruct as run
+    from bigs.commands.run.reconstruct import reconstruct as run
     from bigs.train.switches import without_all
 
     settings, unused = without_all(settings_of(preset, config, set), without)
@@ -217,7 +217,7 @@ def render(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.views import Shot, Wanted, background_of, render_run
+    from bigs.commands.render.views import Shot, Wanted, background_of, render_run
 
     shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
     wanted = Wanted(out, video, depth, background_of(background))
@@ -255,9 +255,9 @@ def export(
         clip: the clip with the input images, for rerun, if it is not where the run found it.
     """
     from bigs.checks import InputError
-    from bigs.commands.formats import Choice, check_format, write_format
-    from bigs.commands.run_clip import clip_of_run
-    from bigs.commands.run_folder import load_run
+    from bigs.commands.export.formats import Choice, check_format, write_format
+    from bigs.commands.folder.clip import clip_of_run
+    from bigs.commands.folder.contents import load_run
 
     if not format:
         raise InputError(f"--format: expected one or more of {', '.join(get_args(Format))}, found none")
@@ -297,7 +297,7 @@ def view(
         clip: the clip with the input images, if it is not where the run found it.
         gt: ground truth to show beside the result, as for bigs eval.
     """
-    from bigs.commands.view import view as serve
+    from bigs.commands.render.live import view as serve
 
     with telling():
         viewer = serve(run, host, port, clip=clip, gt=gt)
@@ -332,8 +332,8 @@ def ablate(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.ablate import ablate as run
-    from bigs.commands.ablate import default_rows
+    from bigs.commands.run.ablate import ablate as run
+    from bigs.commands.run.ablate import default_rows
 
     settings = settings_of(preset, config, set, default="fast")
     with telling() as tell:

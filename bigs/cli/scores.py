@@ -39,8 +39,8 @@ def evaluate(
         threads: CPU threads; 0 takes all.
     """
     use_threads(threads)
-    from bigs.commands.evaluation import EvaluationPlan, compare_runs, evaluate_run, run_names
-    from bigs.commands.paper_tables import beside_paper
+    from bigs.commands.evaluate.paper_tables import beside_paper
+    from bigs.commands.evaluate.runs import EvaluationPlan, compare_runs, evaluate_run, run_names
 
     if not runs:
         raise InputError("bigs eval: expected a run folder, found none")
@@ -90,7 +90,7 @@ def submission(
         hold_class: write dictionaries of HOLD's class common.xdict.xdict, for an evaluator that calls its
             methods; plain Python then cannot open them without that class.
     """
-    from bigs.commands.submission import submit
+    from bigs.commands.export.submission import submit
 
     if hold_class and not runs:
         raise InputError("--hold-class: expected --runs with it, found none")

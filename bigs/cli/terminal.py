@@ -23,9 +23,9 @@ RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 if TYPE_CHECKING:
     from bigs.bench.page import Table
-    from bigs.train.config import RunConfig
+    from bigs.train.plan.config import RunConfig
 
-# The names of `train.presets.PRESETS`, spelled out because importing those takes seconds; a test compares.
+# The names of `PRESETS` in `train.plan.presets`, spelled out: its import takes seconds; a test compares.
 Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 
 # A file or a pipe has no width; tables there are as wide as they need to be.
@@ -133,8 +133,8 @@ def settings_of(
         raise InputError(
             f"--preset {preset}: expected none beside --config, which is a whole plan, found {file}"
         )
-    from bigs.train.config_file import load_config, with_changes
-    from bigs.train.presets import PRESETS
+    from bigs.train.plan.config_file import load_config, with_changes
+    from bigs.train.plan.presets import PRESETS
 
     return with_changes(PRESETS[preset or default] if file is None else load_config(file), changes)
 

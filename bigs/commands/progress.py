@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
 from bigs.commands.spoken import Spoken, spoken
-from bigs.train.config import GuidanceStage, OptimizeStage, RunConfig, Stage
+from bigs.train.plan.config import GuidanceStage, OptimizeStage, RunConfig, Stage
 
 
 @contextmanager

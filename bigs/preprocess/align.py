@@ -21,8 +21,8 @@ from bigs.data.touching import masks_touch
 from bigs.geometry.surface import DistanceGrid, inlier_points
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
-from bigs.preprocess.hands import posed_track
-from bigs.preprocess.object_surface import RoughSurface, SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.hands.tracks import posed_track
+from bigs.preprocess.object.rough_surface import RoughSurface, SurfaceConfig, rough_surface, visual_hull
 from bigs.types import Side
 
 

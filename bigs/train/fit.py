@@ -20,10 +20,13 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.motion.tracker import TrackedMotion
-from bigs.train.background import unknown_occluders
-from bigs.train.build import build_scene
-from bigs.train.checkpoint import load_checkpoint, save_checkpoint
-from bigs.train.config import (
+from bigs.train.grasps.find import find_grasps
+from bigs.train.grasps.scale_search import search_object_scale
+from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
+from bigs.train.loop.evidence import EvidenceSource
+from bigs.train.loop.run_stage import StageProgress, StageState, run_stage
+from bigs.train.loop.stopwatch import Stopwatch
+from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
@@ -34,14 +37,11 @@ from bigs.train.config import (
     SplitStage,
     Stage,
 )
-from bigs.train.evidence import EvidenceSource
-from bigs.train.grasps import find_grasps
-from bigs.train.loop import StageProgress, StageState, run_stage
-from bigs.train.object_motion import find_object_motion, in_words
-from bigs.train.prior_stages import run_completion, run_guidance, without_missing_prior
-from bigs.train.scale_search import search_object_scale
-from bigs.train.stopwatch import Stopwatch
+from bigs.train.start.background import unknown_occluders
+from bigs.train.start.build import build_scene
+from bigs.train.start.object_motion import find_object_motion, in_words
 from bigs.train.switches import without
+from bigs.train.unseen.stages import run_completion, run_guidance, without_missing_prior
 from bigs.types import Side
 
 

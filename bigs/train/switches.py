@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from bigs.checks import InputError, check_choice
-from bigs.train.config import (
+from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
@@ -18,7 +19,6 @@ from bigs.train.config import (
     SplitStage,
     Stage,
 )
-from bigs.train.terms import IMAGE_TERMS, TERMS
 
 
 @dataclass(frozen=True)

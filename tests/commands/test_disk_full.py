@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from command_line import Answer, Run, assert_refused, contents
 
-from bigs.commands.formats import FORMATS, write_format, write_outputs
-from bigs.commands.run_folder import load_run
-from bigs.commands.run_log import RunLog, read_log
+from bigs.commands.export.formats import FORMATS, write_format, write_outputs
+from bigs.commands.folder.contents import load_run
+from bigs.commands.folder.log import RunLog, read_log
 
 resource = pytest.importorskip("resource")
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from bigs.commands.progress import progress_listener
 from bigs.commands.spoken import Spoken, spoken
-from bigs.train.presets import PRESETS
+from bigs.train.plan.presets import PRESETS
 
 
 class _Heard(io.StringIO):

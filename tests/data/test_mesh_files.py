@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.commands.prior_train import read_shape
+from bigs.commands.prior.train import read_shape
 from bigs.data.meshes import read_mesh
 
 MIB = 1 << 20

@@ -24,7 +24,7 @@ from bigs.data.moving import move_hand, move_object
 from bigs.data.sfm_folder import load_sfm_folder
 from bigs.data.writers import write_colmap, write_nerfstudio
 from bigs.hand import HandModel
-from bigs.train.initial import initial_trajectory
+from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side
 
 WRITERS: dict[str, Callable[[Path, Clip], Path]] = {"colmap": write_colmap, "nerfstudio": write_nerfstudio}

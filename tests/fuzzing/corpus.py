@@ -14,7 +14,7 @@ import yaml
 
 from bigs.cli import main
 from bigs.colmap import pycolmap
-from bigs.commands.convert import rest_wrist
+from bigs.commands.clips.convert import rest_wrist
 from bigs.data.ground_truth import load_annotation
 from bigs.data.hold import load_hold
 from bigs.data.moving import in_world, move_hand, move_object

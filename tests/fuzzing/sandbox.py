@@ -141,8 +141,8 @@ def import_everything() -> None:
     import bigs.commands
     from bigs.hand import load_hand_models
 
-    for module in pkgutil.iter_modules(bigs.commands.__path__):
-        importlib.import_module(f"bigs.commands.{module.name}")
+    for module in pkgutil.walk_packages(bigs.commands.__path__, "bigs.commands."):
+        importlib.import_module(module.name)
     PIL.Image.init()
     load_hand_models(None)  # kept from then on
 

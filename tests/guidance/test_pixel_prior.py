@@ -10,7 +10,7 @@ import torch
 from procedural_meshes import write_meshes
 
 from bigs.checks import InputError
-from bigs.commands.prior_train import mesh_pictures, train_prior
+from bigs.commands.prior.train import mesh_pictures, train_prior
 from bigs.guidance import Conditions, SdsConfig, sds_loss
 from bigs.guidance.pixel import PIXELS, PixelConfig, PixelDenoiser, PixelNet, cosine_alphas
 from bigs.guidance.pixel_file import load_pixel_denoiser, save_pixel_net

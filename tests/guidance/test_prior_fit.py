@@ -19,8 +19,8 @@ from safetensors.torch import load_file, save_file
 from tiny_diffusion import as_pipeline
 
 from bigs.cli import prior as cli
-from bigs.commands import prior as command
-from bigs.commands.prior import FittedToken, fit_token
+from bigs.commands.prior import fit as command
+from bigs.commands.prior.fit import FittedToken, fit_token
 from bigs.data.base import Clip
 from bigs.guidance import diffusers_folder
 from bigs.guidance.diffusers_folder import load_parts

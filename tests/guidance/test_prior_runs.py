@@ -12,9 +12,9 @@ import pytest
 from command_line import Answer, assert_refused
 from procedural_meshes import write_meshes
 
-from bigs.train.config import GuidanceStage, RunConfig, SplitStage
-from bigs.train.config_file import save_config
-from bigs.train.presets import SMOKE
+from bigs.train.plan.config import GuidanceStage, RunConfig, SplitStage
+from bigs.train.plan.config_file import save_config
+from bigs.train.plan.presets import SMOKE
 
 # The tiny clip shows all of its object: here a view is asked for nevertheless, and any change is kept.
 STAGE = GuidanceStage(steps=3, views=2, image_size=32, enough=2.0, well_seen=2.0, damage=1e9, unlike=1e9)

@@ -11,13 +11,13 @@ from procedural_meshes import write_meshes
 from toy_denoisers import GaussianImages, front
 
 from bigs.checks import InputError
-from bigs.commands.prior_train import mesh_pictures, train_prior
+from bigs.commands.prior.train import mesh_pictures, train_prior
 from bigs.guidance import Conditions
 from bigs.guidance.pixel import PixelConfig, PixelNet
 from bigs.guidance.pixel_file import load_pixel_denoiser, save_pixel_net
 from bigs.guidance.pixel_training import PixelTrainingConfig
 from bigs.guidance.residual import picture_residual
-from bigs.train.config import GuidanceStage
+from bigs.train.plan.config import GuidanceStage
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.3])

@@ -14,7 +14,7 @@ from bigs.motion.object_map import ObjectMap
 from bigs.motion.refine import RefineConfig, disagreement, polish, refine, smooth_parts, splices
 from bigs.motion.seed import find_seed, smooth_runs
 from bigs.motion.tracks import join_matches
-from bigs.preprocess.sfm_checks import (
+from bigs.preprocess.object.checks import (
     FEW,
     LOOSE,
     OTHERWISE,

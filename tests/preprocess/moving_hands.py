@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from bigs.data.base import HandTrack
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
-from bigs.preprocess.keypoints import Keypoints
+from bigs.preprocess.hands.keypoints import Keypoints
 from bigs.types import Side
 
 K = np.array([[900.0, 0.0, 250.0], [0.0, 910.0, 170.0], [0.0, 0.0, 1.0]])

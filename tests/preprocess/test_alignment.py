@@ -18,7 +18,7 @@ from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices, sample_grid
 from bigs.preprocess.artefacts import ObjectSfm
-from bigs.preprocess.object_surface import SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, visual_hull
 from bigs.types import Side
 
 FRAMES = 12

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.commands import preprocess_object
-from bigs.commands.preprocess_object import object_step
-from bigs.commands.preprocess_request import PreprocessRequest
+from bigs.commands.preprocess import object_steps
+from bigs.commands.preprocess.object_steps import object_step
+from bigs.commands.preprocess.request import PreprocessRequest
 from bigs.preprocess.artefacts import FrameSet, ObjectSfm, read_frame_set, read_object_sfm, write_frame_set
-from bigs.preprocess.sfm import SfmReport
-from bigs.preprocess.sfm_checks import REVERSED, SfmChecks
+from bigs.preprocess.object.checks import REVERSED, SfmChecks
+from bigs.preprocess.object.sfm import SfmReport
 
 FRAMES = 5
 
@@ -64,7 +64,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         model = np.zeros(FRAMES, dtype=int)
         return sfm, SfmReport(counts, counts, [list(range(FRAMES))], model, checks, 50.0, 1)
 
-    monkeypatch.setattr(preprocess_object, "structure_from_motion", fake)
+    monkeypatch.setattr(object_steps, "structure_from_motion", fake)
     return calls
 
 

@@ -14,15 +14,15 @@ from scipy.spatial.transform import Rotation
 from taken_apart import Given, place_true_object
 
 from bigs.checks import InputError
-from bigs.commands.preprocess import preprocess
-from bigs.commands.preprocess_request import PreprocessRequest, StepOutcome
+from bigs.commands.preprocess.all_steps import preprocess
+from bigs.commands.preprocess.request import PreprocessRequest, StepOutcome
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.hold import load_hold
 from bigs.hand import HandModel
 from bigs.metrics.report import evaluate
-from bigs.preprocess.camera import CameraRequest
-from bigs.preprocess.frames import FrameConfig
-from bigs.train.initial import initial_trajectory
+from bigs.preprocess.frames.camera import CameraRequest
+from bigs.preprocess.frames.extract import FrameConfig
+from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side
 from bigs.unpickle import load_npy
 

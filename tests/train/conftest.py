@@ -7,7 +7,7 @@ from toy_stages import held_cube, random_evidence
 
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
-from bigs.train.step import Evidence
+from bigs.train.loop.step import Evidence
 from bigs.types import Side
 
 

@@ -10,10 +10,10 @@ from toy_stages import ALONE, TOGETHER, values
 
 from bigs.checks import InputError
 from bigs.models.scene import Scene
-from bigs.train.config import OptimizeStage
-from bigs.train.loop import StageProgress, StageState, run_stage
-from bigs.train.step import Evidence
-from bigs.train.terms import TERMS
+from bigs.train.loop.run_stage import StageProgress, StageState, run_stage
+from bigs.train.loop.step import Evidence
+from bigs.train.loop.terms import TERMS
+from bigs.train.plan.config import OptimizeStage
 
 # --- what breaks ---
 

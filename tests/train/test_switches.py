@@ -9,11 +9,11 @@ import pytest
 
 from bigs.checks import InputError
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.train.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage
-from bigs.train.plan import check_plan
-from bigs.train.presets import PRESETS
+from bigs.train.check_plan import check_plan
+from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage
+from bigs.train.plan.presets import PRESETS
 from bigs.train.switches import SWITCHES, without, without_all
-from bigs.train.terms import IMAGE_TERMS, TERMS
 
 FAST, PAPER = PRESETS["fast"], PRESETS["paper"]
 

@@ -14,9 +14,9 @@ from bigs.hand import HandModel
 from bigs.models.hand_splats import silhouette_hand
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
-from bigs.train.config import OptimizeStage
-from bigs.train.step import Evidence
-from bigs.train.targets import Targets
+from bigs.train.loop.step import Evidence
+from bigs.train.loop.targets import Targets
+from bigs.train.plan.config import OptimizeStage
 from bigs.types import Side
 
 FRAMES = 3

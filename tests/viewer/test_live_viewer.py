@@ -19,8 +19,8 @@ from browser import changed, open_page, picture, until
 from command_line import Answer, Run, assert_refused
 from PIL import Image
 
-from bigs.commands.rendering import render_frame
-from bigs.commands.run_folder import load_run
+from bigs.commands.folder.contents import load_run
+from bigs.commands.render.frame import render_frame
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("viser", reason="needs the extra 'viewer'")

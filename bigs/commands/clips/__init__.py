@@ -1,0 +1,1 @@
+"""Clips as commands take them: opened, described, converted, and the truth beside them."""

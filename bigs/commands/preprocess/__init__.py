@@ -1,0 +1,1 @@
+"""`bigs preprocess`: what a user asks for, the steps in order, and a picture of each."""

@@ -1,0 +1,1 @@
+"""Pictures of a source become numbered frames with a camera."""

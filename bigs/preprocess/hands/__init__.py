@@ -1,0 +1,1 @@
+"""Hand tracks: from keypoints by a fit, or from what other estimators leave."""

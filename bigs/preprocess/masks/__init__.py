@@ -1,0 +1,1 @@
+"""Label images of each frame: from clicks, or from masks that another tool made."""

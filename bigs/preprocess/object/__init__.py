@@ -1,0 +1,1 @@
+"""The object's motion and points from its masked pixels."""

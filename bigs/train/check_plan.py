@@ -1,0 +1,92 @@
+"""Whether a configuration can run at all, told before anything is computed or written."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from bigs.checks import InputError, check_choice
+from bigs.train.loop.density import DensifyConfig
+from bigs.train.loop.optim import GROUPS
+from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.plan.config import (
+    CompletionStage,
+    GuidanceStage,
+    ObjectMotionStage,
+    OptimizeStage,
+    RunConfig,
+    SplitStage,
+    Stage,
+)
+from bigs.train.plan.ranges import check_ranges
+
+# What the renderer is compiled for.
+COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}
+
+
+def check_plan(config: RunConfig) -> None:
+    """Refuse a configuration that cannot run.
+
+    Raises:
+        InputError: no stage, two of one name, an unknown group or term, or a number out of range.
+    """
+    names = [stage.name for stage in config.stages]
+    if not names:
+        raise InputError("config stages: expected at least one stage, found none")
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated:
+        raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
+    check_ranges("config", config)
+    for earlier, stage in pairwise(config.stages):
+        if isinstance(stage, ObjectMotionStage):
+            raise InputError(
+                f"config stages.{stage.name}: expected it first, since all is built on it, "
+                f"found it after {earlier.name}"
+            )
+    for stage in config.stages:
+        where = f"config stages.{stage.name}"
+        if isinstance(stage, OptimizeStage):
+            _check_names(where, stage)
+            for name, given in (("free_frames", stage.free_frames), ("densify", stage.densify is not None)):
+                if given and stage.step != "single-subject":
+                    raise InputError(f"{where}: expected {name} with step single-subject, found {stage.step}")
+            if stage.densify is not None:
+                _check_densify(f"{where}.densify", stage, stage.densify, config.stages)
+    for name, (*others, last) in COMPILED.items():
+        value = getattr(config.raster, name)
+        if value not in (*others, last):
+            known = ", ".join(map(str, others))
+            raise InputError(f"config raster.{name}: expected {known} or {last}, found {value}")
+
+
+def _check_names(where: str, stage: OptimizeStage) -> None:
+    accepted = (*IMAGE_TERMS[stage.step], *TERMS)
+    for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
+        for name in given:
+            check_choice(where, name, known, kind)
+
+
+def _check_densify(
+    where: str, stage: OptimizeStage, config: DensifyConfig, stages: tuple[Stage, ...]
+) -> None:
+    for other in stages[: stages.index(stage)]:
+        if isinstance(other, SplitStage | CompletionStage | GuidanceStage):
+            raise InputError(
+                f"{where}: expected a stage in which the object has a field, found one after {other.name}"
+            )
+    if not {"object.geometry", "object.triplane"} & set(stage.lrs):
+        raise InputError(f"{where}: expected a rate for object.geometry or object.triplane, found neither")
+    # From the least to the largest; a comparison with NaN is false.
+    orders: tuple[dict[str, float], ...] = (
+        {"0": 0.0, "first": config.first, "last": config.last, "1": 1.0},
+        {"every": config.every, "1": 1.0},
+        {"0": 0.0, "threshold": config.threshold},
+        {"0": 0.0, "small": config.small, "large": config.large},
+        {"0": 0.0, "least_opacity": config.least_opacity, "1": 1.0},
+        {"1": 1, "floor": config.floor, "ceiling": config.ceiling},
+    )
+    for order in orders:
+        if not all(low <= high for low, high in pairwise(order.values())):
+            found = ", ".join(map(str, order.values()))
+            raise InputError(f"{where}: expected {' <= '.join(order)}, found {found}")
+    if config.every <= 0.0:
+        raise InputError(f"{where}.every: expected more than 0, found {config.every}")

@@ -1,0 +1,1 @@
+"""Where hands hold the object still, and how large that makes it."""

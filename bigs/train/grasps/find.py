@@ -1,0 +1,286 @@
+"""Grasps of a scene: where they are, by estimates and pictures, and what frames between them start from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from bigs.hand import mirror_rotation
+from bigs.models.grasps import Grasps
+from bigs.models.poses import HandFrames, ObjectFrames
+from bigs.models.scene import Scene
+from bigs.train.grasps.search import (
+    Prices,
+    Stretch,
+    certainties,
+    frame_errors,
+    grasps_by_estimates,
+    grasps_by_frames,
+)
+from bigs.train.plan.config import GraspStage
+from bigs.types import Side
+
+# The joints that tell where a hand is: the wrist, the knuckles and the fingers' ends.
+_JOINTS = (0, 1, 4, 7, 10, 13, 16, 17, 18, 19, 20)
+# However wrong a depth is, a hand that holds the object is within this of its surface, metres.
+_ARM = 0.3
+# A picture says more than an estimate: in the second cut a frame pays by both, half for the estimate.
+_ESTIMATE_SHARE = 0.5
+
+# How badly a hand's outline in poses of all T frames disagrees with its masks: [T] squared error per pixel of
+# the hand, NaN in frames whose masks say nothing.
+Mismatch = Callable[[Side, HandFrames], Tensor]
+
+
+class FoundGrasps(NamedTuple):
+    """The grasps of one hand."""
+
+    stretches: list[range]  # in order, disjoint
+    certainty: Tensor  # [T] in [0, 1]; 0 outside grasps
+
+    def text(self) -> str:
+        """In words, with the mean certainty of each."""
+        parts = [
+            f"{s.start}-{s.stop - 1} ({float(self.certainty[s.start : s.stop].mean()):.0%})"
+            for s in self.stretches
+        ]
+        return ", ".join(parts) or "(none)"
+
+
+@torch.no_grad()
+def find_grasps(
+    scene: Scene, stage: GraspStage, touching: dict[Side, Tensor], mismatch: Mismatch | None = None
+) -> dict[Side, FoundGrasps]:
+    """Find the grasps of every hand in the scene as it is, and let the object carry the hand through them.
+
+    The estimates propose grasps. Each is then carried with the object to all frames, and what the masks say
+    there decides which frames it has: grasps grow, shrink, take the place of one another, or go.
+
+    All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
+    estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an
+    outline tells them (see `expected_depths`).
+
+    Args:
+        scene: changed in place.
+        stage: the prices.
+        touching: for each hand [T] 1 where its mask and the object's meet.
+        mismatch: asks the pictures; without it the estimates alone decide.
+    """
+    frames = torch.arange(scene.n_frames)
+    found = {}
+    for side in scene.sides:
+        at = scene.at(frames)
+        poses, carrier, own = at.hand(side), at.object, scene.hand_poses[side]
+        found[side] = _search(scene, side, stage, touching[side] > 0, mismatch)
+        of_frame = torch.full((scene.n_frames,), -1)
+        for g, stretch in enumerate(found[side].stretches):
+            of_frame[stretch.start : stretch.stop] = g
+        scene.grasps[side].set(of_frame, stage.slack, poses, carrier, found[side].certainty)
+        held = scene.grasps[side].held(frames)
+        own.has_expected_depth.copy_(~held & held.any())
+        if held.any():
+            log_depth = poses.wrist[:, 2].log()
+            own.expected_log_depth.copy_(expected_depths(log_depth, own.estimated_log_depth, held))
+            correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
+            corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, held))
+            poses = poses._replace(
+                hand_pose=torch.where(held[:, None, None, None], poses.hand_pose, corrected)
+            )
+        own.restart(poses)
+        orient = scene.at(frames).hand(side).global_orient
+        seen = scene.at(frames).object.rotations
+        turned = turned_between(
+            orient,
+            mirror_rotation(seen) if side == "left" else seen,
+            found[side].stretches,
+            stage.longest_move,
+        )
+        own.base_orient.copy_(turned)
+    return found
+
+
+def _search(
+    scene: Scene, side: Side, stage: GraspStage, touching: Tensor, mismatch: Mismatch | None
+) -> FoundGrasps:
+    at = scene.at(torch.arange(scene.n_frames))
+    poses, carrier = at.hand(side), at.object
+    points, information = _in_object_frame(scene, side, stage)
+    touches = touching.numpy()
+    reach = float(carrier.scale * scene.object_surface.verts.norm(dim=1).max()) + _ARM
+
+    def reached(stretches: list[range]) -> list[range]:
+        """Those in which the hand is near the object; its outline may meet the object's metres away."""
+        places = [_place(points[s], information[s]) for s in stretches]
+        return [
+            s
+            for s, place in zip(stretches, places, strict=True)
+            if np.linalg.norm(place, axis=1).min() < reach
+        ]
+
+    prices = Prices(stage.free, stage.grasp, stage.least, stage.gap)
+    proposed = reached(grasps_by_estimates(points, information, touches, prices))
+    stretches = [Stretch(frames, h) for h, frames in enumerate(proposed)]
+    costs = _estimate_costs(points, information, proposed)
+    if mismatch is not None:
+        # What a hand in its own pose comes to in most frames, though not in those whose estimate is off.
+        usual = float(mismatch(side, poses).nanquantile(0.25))
+        apart = prices.free * ~touches
+        for _ in range(stage.rounds):
+            hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, stage.least))
+            pictures = np.stack(
+                [_excess(mismatch, side, poses, carrier, h, usual) for h in hypotheses]
+                or [np.zeros((0, scene.n_frames))]
+            ).reshape(len(hypotheses), scene.n_frames)
+            by_estimate = _estimate_costs(points, information, hypotheses)
+            costs = prices.free * pictures / stage.excess + _ESTIMATE_SHARE * np.minimum(
+                by_estimate, prices.free
+            )
+            costs = np.maximum(costs, apart)
+            again = grasps_by_frames(costs, prices)
+            settled = [s.frames for s in again] == [s.frames for s in stretches]
+            stretches = again
+            if settled:
+                break
+    sure = np.zeros(scene.n_frames)
+    for frames, hypothesis in stretches:
+        sure[frames] = certainties(costs[hypothesis, frames], prices.free)
+    return FoundGrasps([s.frames for s in stretches], torch.as_tensor(sure, dtype=torch.float32))
+
+
+def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
+    """The frames that hypotheses are taken from: each grasp, two neighbours as one, and what no grasp has."""
+    found = list(stretches)
+    found += [range(a.start, b.stop) for a, b in pairwise(stretches)]
+    edges = [0, *(edge for s in stretches for edge in (s.start, s.stop)), count]
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        # Windows that overlap by half: a grasp lies in one of them for the most part.
+        step = 2 * least
+        found += [range(a, min(a + step, stop)) for a in range(start, stop - least + 1, least)]
+    return found
+
+
+def _estimate_costs(points: np.ndarray, information: np.ndarray, stretches: list[range]) -> np.ndarray:
+    """[H, T] squared errors of the estimates in every frame, for the mean hand of each stretch."""
+    rows = [frame_errors(points, information, _place(points[s], information[s])) for s in stretches]
+    return np.stack(rows) if rows else np.zeros((0, len(points)))
+
+
+def _place(points: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """The still hand [K, 3] that explains some frames best, whatever a few of them say."""
+    place = np.median(points, axis=0)
+    for _ in range(3):
+        trust = 1.0 / (1.0 + frame_errors(points, information, place))
+        weighted = trust[:, None, None] * information
+        place = np.linalg.solve(weighted.sum(0), np.einsum("tij,tkj->ik", weighted, points)).T
+    return place
+
+
+def _excess(
+    mismatch: Mismatch, side: Side, poses: HandFrames, carrier: ObjectFrames, frames: range, usual: float
+) -> np.ndarray:
+    """How much worse than `usual` a hand that the object carries through all T frames fits its masks."""
+    count = len(carrier.centers)
+    grasp = Grasps(count, mirrored=side == "left")
+    of_frame = torch.full((count,), -1)
+    of_frame[frames.start : frames.stop] = 0
+    grasp.set(of_frame, 0.0, poses, carrier)
+    grasp.of_frame.zero_()
+    carried = mismatch(side, grasp(torch.arange(count), carrier))
+    return torch.nan_to_num(carried - usual, nan=0.0).double().numpy()
+
+
+def _in_object_frame(scene: Scene, side: Side, stage: GraspStage) -> tuple[np.ndarray, np.ndarray]:
+    """Joints [T, K, 3] of a hand in the object's frame, metres, and the information [T, 3, 3] of each."""
+    at = scene.at(torch.arange(scene.n_frames))
+    joints, carrier = at.joints(side), at.object
+    points = carrier.scale * at.in_object_frame(joints)[:, list(_JOINTS)]
+    wrist = joints[:, 0].double()
+    ray = torch.nn.functional.normalize(wrist, dim=-1)
+    ray = (carrier.rotations.double().transpose(-1, -2) @ ray[..., None])[..., 0]
+    along = ray[:, :, None] * ray[:, None, :]
+    aside = torch.eye(3, dtype=torch.float64) - along
+    depth = wrist.norm(dim=-1)[:, None, None]
+    information = aside / (stage.error_aside * depth) ** 2 + along / (stage.error_along * depth) ** 2
+    return points.double().numpy(), information.numpy()
+
+
+def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest: int) -> Tensor:
+    """Orientations in which a hand turns evenly from one grasp to the next, as seen from the object.
+
+    From the last frame of a grasp to the first of the next the turn follows the minimum-jerk profile of human
+    reaching (Flash and Hogan 1985). Silhouettes tell a turned hand badly; what it came from and what it turns
+    into are known well.
+
+    Args:
+        orient: [T, 3, 3] the hand's orientation.
+        carrier: [T, 3, 3] the object's.
+        grasps: stretches of frames, in order and disjoint.
+        longest: moves that take more frames than this are left as they are.
+
+    Returns:
+        [T, 3, 3] with the frames between grasps replaced.
+    """
+    orient = orient.clone()
+    for before, after in pairwise(grasps):
+        first, last = before[-1], after[0]
+        if last - first - 1 > longest:
+            continue
+        there = carrier[last].T @ orient[last]
+        here = carrier[first].T @ orient[first]
+        turn = matrix_to_axis_angle(here.T @ there)
+        between = torch.arange(first + 1, last)
+        u = (between - first) / (last - first)
+        share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        orient[between] = carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * turn)
+    return orient
+
+
+def expected_depths(log_depth: Tensor, estimated: Tensor, held: Tensor) -> Tensor:
+    """Logarithmic depths [T] that frames outside grasps are expected to have.
+
+    An outline says little of the depth of a hand that the image cuts off. Two guesses with unrelated errors
+    say more together: the way from one grasp straight to the next, and the estimate less the errors that
+    grasps have shown it to have.
+
+    Args:
+        log_depth: [T] as found; only those of grasps are read.
+        estimated: [T] before any image was looked at.
+        held: [T] bool, which frames are in grasps; at least one.
+    """
+    times = np.arange(len(held))
+    known = held.numpy()
+    between = torch.from_numpy(np.interp(times, times[known], log_depth.numpy()[known])).to(log_depth)
+    carried = estimated + carried_errors(log_depth - estimated, held)
+    return 0.5 * (between + carried)
+
+
+def carried_errors(errors: Tensor, known: Tensor, width: float = 10.0, noise: float = 1.0) -> Tensor:
+    """What errors in some frames say about the others: Gaussian-process regression over time.
+
+    Estimators err alike in frames near each other, and to a part in all frames of a clip: the covariance of
+    two frames is a constant plus a bell of `width` frames, of equal weight.
+
+    Args:
+        errors: [T, ...] in any unit; only those of `known` frames are read.
+        known: [T] bool, at least one.
+        width: of the bell, in frames.
+        noise: standard deviation of a known error relative to that of either part.
+
+    Returns:
+        [T, ...] expected errors.
+    """
+    times = torch.arange(len(errors), dtype=errors.dtype)
+    seen = times[known]
+
+    def covariance(a: Tensor, b: Tensor) -> Tensor:
+        return 1.0 + torch.exp(-0.5 * ((a[:, None] - b) / width) ** 2)
+
+    gram = covariance(seen, seen) + noise**2 * torch.eye(len(seen), dtype=errors.dtype)
+    weights = torch.linalg.solve(gram, errors[known].reshape(len(seen), -1))
+    return (covariance(times, seen) @ weights).reshape(errors.shape)

@@ -1,0 +1,112 @@
+"""The object's size from contact: at which size do hands that touch it in the image touch it in space?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bigs.losses.contact import surface_gaps
+from bigs.models.scene import Scene
+from bigs.train.plan.config import ScaleSearchStage
+from bigs.types import Side
+
+# Until grasps are known, so many frames on end are one piece of evidence: errors of neighbours are alike.
+_PIECE = 8
+
+
+class FoundSize(NamedTuple):
+    """What a search came to."""
+
+    factor: float  # on the scale before
+    # Standard error of the factor, by how it changes without one grasp or the other; NaN if one alone speaks.
+    spread: float
+    factors: Tensor  # [C] tried
+    costs: Tensor  # [C]
+
+    def text(self) -> str:
+        """The factor, and its error where it is known."""
+        known = self.spread == self.spread
+        return f"{self.factor:.3f} ± {self.spread:.3f}" if known else f"{self.factor:.3f}"
+
+
+@torch.no_grad()
+def search_object_scale(
+    scene: Scene,
+    stage: ScaleSearchStage,
+    touching: dict[Side, Tensor],
+    occlusion: Callable[[], float] = lambda: 0.0,
+) -> FoundSize:
+    """Set the object's scale, which leaves its projection alone, to where the hands touch its surface best.
+
+    The cost is the contact term's own plus `stage.labels_weight` times `occlusion()`: how badly the scene as
+    it is agrees with what hides what in the images. Every frame counts by how sure its touch is.
+
+    Args:
+        scene: changed in place; left as it was when no frame touches.
+        stage: the factors to try.
+        touching: for each hand [T] in [0, 1], how sure it is that it touches.
+        occlusion: see above.
+    """
+    factors = torch.linspace(1.0 - stage.span, 1.0 + stage.span, stage.candidates)
+    start = scene.object_poses.log_scale.clone()
+    frames = torch.arange(scene.n_frames)
+    hands = {side: scene.at(frames).verts(side) for side in scene.sides}
+    gaps = {side: torch.zeros(len(factors), scene.n_frames) for side in hands}
+    hidden = torch.zeros(len(factors))
+    for c, factor in enumerate(factors):
+        scene.object_poses.log_scale.copy_(start + factor.log())
+        scale = scene.object_poses.log_scale.exp()
+        for side, verts in hands.items():
+            gaps[side][c] = surface_gaps(
+                scale * scene.object_distance(scene.at(frames).in_object_frame(verts))
+            )
+        hidden[c] = stage.labels_weight * occlusion()
+    scene.object_poses.log_scale.copy_(start)
+    costs = _costs(gaps, touching) + hidden
+    if not any(bool(t.any()) for t in touching.values()):
+        return FoundSize(1.0, float("nan"), factors, costs)
+    best = _lowest(factors, costs)
+    without = [
+        _lowest(factors, _costs(gaps, touching | {side: touching[side] * ~piece}) + hidden)
+        for side in hands
+        for piece in _pieces(scene, side, touching[side])
+    ]
+    scene.object_poses.log_scale.copy_(start + torch.tensor(best).log())
+    return FoundSize(best, _jackknife(without), factors, costs)
+
+
+def _costs(gaps: dict[Side, Tensor], touching: dict[Side, Tensor]) -> Tensor:
+    """The contact term [C] at every factor: the mean over the hands of their mean over frames."""
+    means = [(gaps[side] * touching[side]).sum(1) / touching[side].sum().clamp_min(1.0) for side in gaps]
+    return torch.stack(means).mean(0)
+
+
+def _lowest(factors: Tensor, costs: Tensor) -> float:
+    """The factor of the least cost, between those tried by the parabola through it and its neighbours."""
+    best = int(costs.argmin())
+    if best in (0, len(costs) - 1):
+        return float(factors[best])
+    before, here, after = costs[best - 1 : best + 2].tolist()
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+    return float(factors[best] + shift * (factors[best + 1] - factors[best]))
+
+
+def _pieces(scene: Scene, side: Side, touching: Tensor) -> list[Tensor]:
+    """Frames [T] (bool) that stand or fall together: a grasp's, or a few on end."""
+    grasps = scene.grasps[side]
+    numbers = grasps.of_frame if grasps.count else torch.arange(len(touching)) // _PIECE
+    pieces = [(numbers == g) & (touching > 0) for g in numbers.unique() if g >= 0]
+    return [piece for piece in pieces if piece.any()]
+
+
+def _jackknife(without: list[float]) -> float:
+    """The standard error of an estimate from what it is without each of its pieces of evidence."""
+    count = len(without)
+    if count < 2:
+        return float("nan")
+    found = torch.tensor(without)
+    return float(((count - 1) / count * (found - found.mean()).square().sum()).sqrt())

@@ -1,0 +1,1 @@
+"""Optimisation: what a stage looks at, its steps, loss terms, optimiser, density control and checkpoints."""

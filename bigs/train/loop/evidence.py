@@ -1,0 +1,128 @@
+"""What each stage looks at: images at its size, touching frames, cheap silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bigs.data.base import Clip
+from bigs.losses.perceptual import VggWeights
+from bigs.models.hand_splats import CanonicalHand, silhouette_hand
+from bigs.models.poses import HandFrames
+from bigs.models.scene import Scene
+from bigs.train.grasps.find import Mismatch
+from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.targets import Targets, crop_box, load_targets
+from bigs.train.loop.terms import labels
+from bigs.train.plan.config import GraspStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.start.initial import touching_frames
+from bigs.types import Side
+
+# Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
+SILHOUETTE_SIGMA = 0.0022
+# Centres go in by this many standard deviations of a Gaussian as it appears in the image. Opaque neighbours
+# overlap, so their common alpha falls to one half well outside the centres.
+INSET = 2.0
+
+
+class EvidenceSource:
+    """Makes each stage's evidence; what several stages share is made once, when first asked for."""
+
+    def __init__(
+        self,
+        clip: Clip,
+        unknown: np.ndarray,
+        scene: Scene,
+        config: RunConfig,
+        perceptual: VggWeights | None,
+    ) -> None:
+        self.clip = clip
+        self.unknown = unknown
+        self.scene = scene
+        self.config = config
+        self.perceptual = perceptual
+        self.box = crop_box(clip)
+        # Where the masks of hand and object meet.
+        self.meeting: dict[Side, Tensor] = {
+            side: torch.as_tensor(touching_frames(clip, side), dtype=torch.float32)
+            if scene.object_splats is not None
+            else torch.zeros(len(clip))
+            for side in scene.sides
+        }
+        self._targets: dict[int, Targets] = {}
+
+    def touching(self) -> dict[Side, Tensor]:
+        """For each hand [T] 1 where it touches the object, as far as is known by now.
+
+        Masks also meet where a hand only passes before the object; once its grasps are found, they count.
+        """
+        touching = {}
+        for side, meeting in self.meeting.items():
+            grasps = self.scene.grasps[side]
+            touching[side] = (grasps.of_frame >= 0).to(meeting) if grasps.count else meeting
+        return touching
+
+    def certainty(self) -> dict[Side, Tensor]:
+        """For each hand [T] how sure it is that it touches the object: that of its grasps, once found."""
+        return {
+            side: self.scene.grasps[side].certainty if self.scene.grasps[side].count else touching
+            for side, touching in self.touching().items()
+        }
+
+    def evidence(self, stage: Stage) -> Evidence:
+        targets = self.targets(stage.image_size)
+        silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
+        return Evidence(
+            targets, self.touching(), silhouettes, self.config.contact, self.config.raster, self.perceptual
+        )
+
+    def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:
+        """The label term of the scene as it is, over some frames: which subject hides which."""
+        evidence = self.evidence(stage)
+        frames = torch.linspace(0, len(self.clip) - 1, min(stage.frames, len(self.clip))).round().long()
+        entities = self.scene.entities
+        with torch.no_grad():
+            canonical = self.scene.canonical(entities)
+        return lambda: float(labels(Step(self.scene, evidence, entities, canonical, frames)))
+
+    def mismatch(self, stage: GraspStage) -> Mismatch:
+        """How badly a hand's outline, in any poses of all frames, disagrees with its masks."""
+        evidence = self.evidence(stage)
+        frames = torch.arange(len(self.clip))
+        step = Step(self.scene, evidence, (), {}, frames)
+
+        @torch.no_grad()
+        def ask(side: Side, poses: HandFrames) -> Tensor:
+            posed = self.scene.posed_hand(side, poses, evidence.silhouettes[side])
+            alphas = step.render(posed).alphas.squeeze(-1)
+            own, hidden = evidence.targets.shares[side], evidence.targets.hidden[side]
+            squares = (alphas - alphas.clamp(own, own + hidden)).square().sum((1, 2))
+            # A hand that hardly shows is no measure of what is wrong with it.
+            area = own.sum((1, 2))
+            shown = evidence.targets.foreground.sum((1, 2)) > 0
+            return torch.where(shown, squares / area.clamp_min(0.25 * area.median()), torch.nan)
+
+        return ask
+
+    def targets(self, size: int) -> Targets:
+        if size not in self._targets:
+            long_side = max(self.clip.width, self.clip.height)
+            scale = min(1.0, size / long_side) if size else 1.0
+            # One resolution at a time: a stage that returns to an earlier one is rare, memory is not.
+            self._targets = {size: load_targets(self.clip, self.unknown, scale, self.box)}
+        return self._targets[size]
+
+    def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
+        """A hand whose outline lies right at this resolution.
+
+        The rasteriser widens every Gaussian by eps2d square pixels, so the coarser the image, the further in
+        the centres must go.
+        """
+        model = self.scene.hand_model(side)
+        depth = self.scene.hand_poses[side].position.base_log_depth.exp().median()
+        pixel = float(depth / targets.K[0, 0])
+        spread = (SILHOUETTE_SIGMA**2 + self.config.raster.eps2d * pixel**2) ** 0.5
+        return silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread)

@@ -1,0 +1,300 @@
+"""One stage of optimisation: the same loop for every stage, which is told apart by data only."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from bigs.checks import InputError, expected_among
+from bigs.losses.weighted import weighted_sum
+from bigs.models.object_splats import ObjectSplats
+from bigs.models.scene import Scene
+from bigs.train.loop.density import DensifyConfig, Pull, densified
+from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_cosine_rates
+from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.plan.config import OptimizeStage
+from bigs.types import Entity
+
+
+class StageProgress(NamedTuple):
+    """What a hook sees after every step."""
+
+    step: int  # steps done
+    steps: int  # steps planned
+    terms: dict[str, float]
+    loss: float
+    seconds: float  # of this step
+
+
+class StageState(NamedTuple):
+    """What has to be kept to continue a stage exactly: steps done, and the optimiser with its moments."""
+
+    step: int
+    optimizer: torch.optim.Optimizer
+    best: float  # smoothed loss that the stopping rule compares with
+    best_step: int
+    smoothed: float
+    retreats: int  # how often the stage went back after something that was not finite
+    found: Mapping[str, Tensor]  # what the stage began from, by name, where it has to know that
+    pull: Pull | None  # at the object's Gaussians since they were last cloned, split and pruned
+
+    @classmethod
+    def begun(
+        cls, step: int, optimizer: torch.optim.Optimizer, found: Mapping[str, Tensor] | None = None
+    ) -> StageState:
+        """After `step` steps, of whose losses nothing is known yet."""
+        return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {}, None)
+
+
+# The parts of `StageState` that are plain numbers.
+NUMBERS = ("step", "best", "best_step", "smoothed", "retreats")
+# A stage gives up after so many retreats; each halves its rates.
+MOST_RETREATS = 4
+
+
+def stage_entities(scene: Scene, stage: OptimizeStage) -> tuple[Entity, ...]:
+    """The subjects a stage renders: all together, or alone those of which something may move."""
+    if stage.step == "interacting-subjects":
+        return scene.entities
+    subjects = {group.split(".")[0] for group in stage.lrs}
+    return tuple(
+        entity
+        for entity in scene.entities
+        if ("object" if entity == "object" else "hand") in subjects
+        and not (stage.free_frames and entity != "object" and len(scene.free_frames(entity)) == 0)
+    )
+
+
+def choose_frames(n_frames: int, stage: OptimizeStage, seed: int, step: int) -> Tensor:
+    """The frames of one step, a function of the seed and the step alone, so that a resumed run repeats them.
+
+    Every pass over the clip visits each frame once in a shuffled order.
+    """
+    count = stage.frames_per_step
+    if count <= 0 or count >= n_frames:
+        return torch.arange(n_frames)
+    per_pass = -(-n_frames // count)
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step // per_pass)
+    order = torch.randperm(n_frames, generator=generator)
+    # The last batch of a pass is filled up from the pass's beginning.
+    start = (step % per_pass) * count
+    return torch.cat([order, order])[start : start + count].sort().values
+
+
+def run_stage(
+    scene: Scene,
+    stage: OptimizeStage,
+    evidence: Evidence,
+    seed: int,
+    resume: dict[str, Any] | None = None,
+    after_step: Callable[[StageProgress, StageState], None] = lambda progress, state: None,
+    keep_every: int = 100,
+    warn: Callable[[str], None] = lambda text: None,
+) -> StageState:
+    """Optimise `scene` in place.
+
+    A step whose loss or gradient is not finite is not taken: the stage goes back to the last state that was
+    kept and on from there at half its rates.
+
+    Args:
+        scene: the scene.
+        stage: what to do.
+        evidence: what the terms look at.
+        seed: of the choice of frames.
+        resume: steps done, moments and stopping state as `checkpoint.load_checkpoint` returns them.
+        after_step: called after every step.
+        keep_every: steps between the states that are kept to go back to.
+        warn: told what was not finite, and where the stage went back to.
+
+    Raises:
+        InputError: the stage names an unknown group or term.
+        FloatingPointError: losses or gradients are not finite however small the steps; names the first.
+    """
+    image_terms = IMAGE_TERMS[stage.step]
+    unknown = [name for name in stage.weights if name not in TERMS and name not in image_terms]
+    if unknown:
+        accepted = expected_among(unknown[0], [*image_terms, *TERMS], "terms")
+        raise InputError(f"stage {stage.name}: {accepted}")
+    if "perceptual" in stage.weights and evidence.perceptual is None:
+        raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
+    optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)
+    state = StageState.begun(0, optimizer)
+    densify = None if scene.object_splats is None else stage.densify
+    if densify is not None:
+        state = state._replace(pull=Pull.none(len(_field_of_object(scene, stage).base_points)))
+    if resume is not None:
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
+        state = state._replace(**{key: resume[key] for key in NUMBERS}, pull=resume["pull"])
+
+    entities = stage_entities(scene, stage)
+    frozen = {
+        entity
+        for entity in entities
+        if not set(FIELD_GROUPS["object" if entity == "object" else "hand"]) & set(stage.lrs)
+    }
+    needs_canonical = any(
+        name in image_terms or name in ("color", "scale", "lbs", "offset") for name in stage.weights
+    )
+    with torch.no_grad():
+        # A frozen field is evaluated once for the whole stage.
+        fixed = scene.canonical(frozen) if needs_canonical else {}
+
+    kept = _Kept(scene, state)
+    while state.step < stage.steps and not _has_settled(stage, state):
+        began = time.perf_counter()
+        moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
+        frames = choose_frames(scene.n_frames, stage, seed, state.step)
+        step = Step(
+            scene,
+            evidence,
+            entities if needs_canonical else (),
+            {**fixed, **scene.canonical(moving)},
+            frames,
+            "labels" in stage.weights,
+            seed * 1_000_003 + state.step,
+            stage.free_frames,
+            densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
+        )
+        terms, problem = _evaluate(step, stage)
+        loss = weighted_sum(terms, stage.weights) if problem is None else None
+        if loss is not None:
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            if stage.free_frames:
+                _spare_grasps(scene)
+            problem = _unbounded_gradient(scene)
+        if loss is None or problem is not None:
+            where = f"stage {stage.name}, step {state.step}: {problem}"
+            if state.retreats == MOST_RETREATS:
+                raise FloatingPointError(where)
+            state = kept.restore(scene, optimizer)._replace(retreats=state.retreats + 1)
+            warn(f"{where}; back to step {state.step} with half the rates")
+            continue
+        progress = state.step / max(stage.steps, 1)
+        set_cosine_rates(optimizer, progress, stage.final_lr, 0.5**state.retreats)
+        optimizer.step_frames(frames)
+        state = _advance(stage, state, float(loss.detach()))
+        if densify is not None:
+            state = _densify(scene, step, densify, stage.steps, state)
+        if state.step % keep_every == 0:
+            kept = _Kept(scene, state)
+        after_step(
+            StageProgress(
+                state.step,
+                stage.steps,
+                {name: float(value.detach()) for name, value in terms.items()},
+                float(loss.detach()),
+                time.perf_counter() - began,
+            ),
+            state,
+        )
+    return state
+
+
+def _field_of_object(scene: Scene, stage: OptimizeStage) -> ObjectSplats:
+    if not isinstance(scene.object_splats, ObjectSplats):
+        raise InputError(
+            f"stage {stage.name}: expected densify where the object has a field, found Gaussians of their own"
+        )
+    return scene.object_splats
+
+
+def _densify(scene: Scene, step: Step, config: DensifyConfig, steps: int, state: StageState) -> StageState:
+    """Add a step to what is known of the object's Gaussians; clone, split and prune them when it is time."""
+    gathered = step.object_pull() if step.watched else None
+    pull = state.pull if gathered is None else state.pull.plus(*gathered)
+    if config.is_due(steps, state.step):
+        splats = scene.object_splats
+        with torch.no_grad():
+            whole = splats()
+        splats.place(densified(splats.anchors, whole, pull, config, splats.config.isotropic))
+        pull = Pull.none(len(splats.base_points))
+    return state._replace(pull=pull)
+
+
+def _spare_grasps(scene: Scene) -> None:
+    """Take the gradient off the frames in which a hand holds the object: they stay as they are."""
+    for side, poses in scene.hand_poses.items():
+        held = scene.grasps[side].of_frame >= 0
+        for residual in (poses.orient, poses.pose, poses.position.ray, poses.position.log_depth):
+            if residual.grad is not None:
+                residual.grad[held] = 0.0
+
+
+def _evaluate(step: Step, stage: OptimizeStage) -> tuple[dict[str, Tensor], str | None]:
+    """The stage's terms, and which of them is not finite."""
+    terms = {}
+    for name in stage.weights:
+        try:
+            terms[name] = (IMAGE_TERMS[stage.step].get(name) or TERMS[name])(step)
+        except InputError as error:
+            # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
+            return terms, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
+    bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+    return terms, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
+
+
+def _first_unbounded(scene: Scene) -> str:
+    """The first parameter that is not finite, with its place: for per-frame parameters that is the frame."""
+    for name, values in scene.named_parameters():
+        wrong = torch.nonzero(~torch.isfinite(values))
+        if len(wrong):
+            return f" ({name} at {wrong[0].tolist()})"
+    return ""
+
+
+def _unbounded_gradient(scene: Scene) -> str | None:
+    for name, values in scene.named_parameters():
+        # A sum is finite only if all of it is, save for overflow, which is no better.
+        if values.grad is not None and not torch.isfinite(values.grad.sum()):
+            wrong = torch.nonzero(~torch.isfinite(values.grad))
+            place = f" at {wrong[0].tolist()}" if len(wrong) else ""
+            return f"the gradient of {name} is not finite{place}"
+    return None
+
+
+class _Kept:
+    """A state to go back to: copies of what is trained and of the optimiser's moments.
+
+    Where the object's field is evaluated is not changed in place, so it needs no copy.
+    """
+
+    def __init__(self, scene: Scene, state: StageState) -> None:
+        self._state = state
+        self._anchors = None if state.pull is None else scene.object_splats.anchors
+        self._values = [p.detach().clone() for p in _trained(state.optimizer)]
+        self._moments = copy.deepcopy(state.optimizer.state_dict()["state"])
+
+    @torch.no_grad()
+    def restore(self, scene: Scene, optimizer: torch.optim.Optimizer) -> StageState:
+        if self._anchors is not None:
+            scene.object_splats.place(self._anchors)
+        for parameter, value in zip(_trained(optimizer), self._values, strict=True):
+            parameter.copy_(value)
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": copy.deepcopy(self._moments)})
+        return self._state
+
+
+def _trained(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def _advance(stage: OptimizeStage, state: StageState, loss: float) -> StageState:
+    smoothed = loss if state.step == 0 else 0.9 * state.smoothed + 0.1 * loss
+    improved = smoothed < state.best * (1.0 - stage.stop_gain)
+    return state._replace(
+        step=state.step + 1,
+        smoothed=smoothed,
+        best=smoothed if improved else state.best,
+        best_step=state.step if improved else state.best_step,
+    )
+
+
+def _has_settled(stage: OptimizeStage, state: StageState) -> bool:
+    return stage.stop_patience > 0 and state.step - state.best_step > stage.stop_patience

@@ -1,0 +1,99 @@
+"""What the images say, at the resolution and crop that a stage works at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bigs.data.base import Clip
+from bigs.train.start.background import share_per_pixel
+from bigs.types import ENTITIES, MASK_VALUES, Entity
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Images and masks of a whole clip, cropped to where anything ever is, and scaled."""
+
+    images: Tensor  # [T, H, W, 3] in [0, 1]
+    shares: dict[Entity, Tensor]  # [T, H, W] share of each pixel that shows the entity
+    unknown: Tensor  # [T, H, W] share of each pixel in which something unlabelled may hide a subject
+    K: Tensor  # [3, 3] intrinsics of the crop
+    width: int
+    height: int
+
+    @cached_property
+    def foreground(self) -> Tensor:
+        """Share of each pixel that shows any entity: [T, H, W]."""
+        return sum(self.shares.values(), torch.zeros(())).clamp(max=1.0)
+
+    @cached_property
+    def hidden(self) -> dict[Entity, Tensor]:
+        """Share of each pixel in which something else may hide an entity: [T, H, W]."""
+        return {
+            entity: sum(
+                (share for other, share in self.shares.items() if other != entity), self.unknown
+            ).clamp(max=1.0)
+            for entity in self.shares
+        }
+
+
+def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:
+    """The box (x0, y0, x1, y1) in pixels that holds every entity in every frame, with a margin.
+
+    A clip without any mask pixel is not cropped.
+    """
+    anything = np.zeros((clip.height, clip.width), dtype=bool)
+    for t in range(len(clip)):
+        anything |= clip.mask(t) != 0
+    if not anything.any():
+        return 0, 0, clip.width, clip.height
+    rows, columns = np.flatnonzero(anything.any(1)), np.flatnonzero(anything.any(0))
+    pad = int(np.ceil(margin * max(clip.width, clip.height)))
+    return (
+        max(int(columns[0]) - pad, 0),
+        max(int(rows[0]) - pad, 0),
+        min(int(columns[-1]) + 1 + pad, clip.width),
+        min(int(rows[-1]) + 1 + pad, clip.height),
+    )
+
+
+def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, int, int, int]) -> Targets:
+    """Read the clip's frames inside `box` and shrink them by area to `scale` times their size.
+
+    `unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size.
+    """
+    x0, y0, x1, y1 = box
+    width, height = (max(1, round(scale * n)) for n in (x1 - x0, y1 - y0))
+    labels = np.stack([clip.mask(t)[y0:y1, x0:x1] for t in range(len(clip))])
+    images = np.stack([clip.image(t)[y0:y1, x0:x1] for t in range(len(clip))])
+    full = torch.from_numpy(images).permute(0, 3, 1, 2)
+    # Frame by frame: a whole clip in float at full size would be the largest array of the run.
+    small = torch.cat(
+        [
+            torch.nn.functional.interpolate(
+                frame[None].float() / 255.0, (height, width), mode="bilinear", antialias=True
+            )
+            for frame in full
+        ]
+    )
+    present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
+    shares = {entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present}
+    # Pixel centres lie at +0.5, so image coordinates scale without an offset.
+    sx, sy = width / (x1 - x0), height / (y1 - y0)
+    K = clip.K.copy()
+    K[0] *= sx
+    K[1] *= sy
+    K[0, 2] -= sx * x0
+    K[1, 2] -= sy * y0
+    return Targets(
+        small.permute(0, 2, 3, 1).contiguous(),
+        shares,
+        share_per_pixel(unknown[:, y0:y1, x0:x1], height, width),
+        torch.as_tensor(K, dtype=torch.float32),
+        width,
+        height,
+    )

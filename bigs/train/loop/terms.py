@@ -1,0 +1,306 @@
+"""The loss terms by name. Each asks a `Step` for what it needs; a rendering is made when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor
+
+from bigs.losses.contact import center_contact, penetration, surface_contact
+from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on, spilled
+from bigs.losses.perceptual import masked_perceptual
+from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
+from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
+from bigs.losses.temporal import acceleration, pose_steps, velocity
+from bigs.train.loop.step import Step
+from bigs.types import Side
+
+
+def _mean(values: Iterable[Tensor]) -> Tensor:
+    values = list(values)
+    return torch.stack(values).mean() if values else torch.zeros(())
+
+
+def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
+    return _mean(
+        loss(step.alone(entity).colors, step.images_alone(entity), step.share_alone(entity))
+        for entity in step.entities
+    )
+
+
+def image_alone(step: Step) -> Tensor:
+    return _each_alone(step, masked_l1)
+
+
+def mse_alone(step: Step) -> Tensor:
+    return _each_alone(step, masked_mse)
+
+
+def ssim_alone(step: Step) -> Tensor:
+    return _each_alone(step, masked_ssim)
+
+
+def mask_alone(step: Step) -> Tensor:
+    return _mean(
+        outside_mask(step.alone(entity).colors, step.foreground_alone(entity)) for entity in step.entities
+    )
+
+
+def mask_random_alone(step: Step) -> Tensor:
+    generator = step.generator()
+    return _mean(
+        outside_mask_on(
+            step.alone(entity).colors,
+            step.alone(entity).alphas,
+            step.foreground_alone(entity),
+            generator,
+        )
+        for entity in step.entities
+    )
+
+
+def perceptual_alone(step: Step) -> Tensor:
+    generator = step.generator()
+    return _mean(
+        masked_perceptual(
+            step.alone(entity).colors,
+            step.images_alone(entity),
+            step.share_alone(entity),
+            step.evidence.perceptual,
+            generator,
+        )
+        for entity in step.entities
+    )
+
+
+def coverage_alone(step: Step) -> Tensor:
+    """Each subject opaque on its own pixels, absent from the background, free where others may hide it."""
+    return _mean(
+        amodal_silhouette(
+            step.alone(entity).alphas.squeeze(-1), step.share_alone(entity), step.hidden_alone(entity)
+        )
+        for entity in step.entities
+    )
+
+
+def image_together(step: Step) -> Tensor:
+    return masked_l1(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
+
+
+def mse_together(step: Step) -> Tensor:
+    return masked_mse(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
+
+
+def ssim_together(step: Step) -> Tensor:
+    return masked_ssim(step.together.colors[..., :3], step.images, step.foreground)
+
+
+def mask_together(step: Step) -> Tensor:
+    """The paper's, sleeves and all; `spill` leaves out what they cover."""
+    return outside_mask(step.together.colors[..., :3], step.foreground)
+
+
+def spill(step: Step) -> Tensor:
+    pixels = step.pixels
+    return spilled(pixels.alphas, pixels.empty, pixels.foreground)
+
+
+def mask_random_together(step: Step) -> Tensor:
+    rendered = step.together
+    return outside_mask_on(rendered.colors[..., :3], rendered.alphas, step.foreground, step.generator())
+
+
+def perceptual_together(step: Step) -> Tensor:
+    return masked_perceptual(
+        step.together.colors[..., :3],
+        step.images,
+        step.foreground,
+        step.evidence.perceptual,
+        step.generator(),
+    )
+
+
+def labels(step: Step) -> Tensor:
+    return label_difference(step.pixels.colors[:, 3:], step.pixels.shares)
+
+
+def silhouette(step: Step) -> Tensor:
+    """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
+
+    def one(side: Side) -> Tensor:
+        posed = step.clip.at(step.frames_of(side)).posed_hand(side, step.evidence.silhouettes[side])
+        alphas = step.render(posed).alphas.squeeze(-1)
+        return amodal_silhouette(alphas, step.share_alone(side), step.hidden_alone(side))
+
+    return _mean(one(side) for side in step.scene.sides if len(step.frames_of(side)))
+
+
+def color(step: Step) -> Tensor:
+    return _mean(color_spread(step.canonical[entity].colors) for entity in step.entities)
+
+
+def scale(step: Step) -> Tensor:
+    return _mean(scale_size(step.canonical[entity].scales) for entity in step.entities)
+
+
+def lbs(step: Step) -> Tensor:
+    return _mean(
+        lbs_deviation(
+            step.canonical[side].weights,
+            step.scene.hand_splats[step.scene.canonical_side(side)].base_weights,
+        )
+        for side in step.sides
+    )
+
+
+def offset(step: Step) -> Tensor:
+    """Squared distance, in millimetres, that the field moves the object's Gaussians."""
+    return (
+        squared_norm(1e3 * step.canonical["object"].offsets)
+        if "object" in step.canonical
+        else torch.zeros(())
+    )
+
+
+def smooth(step: Step) -> Tensor:
+    """The paper's L_smt over the whole clip."""
+
+    def one(side: Side) -> Tensor:
+        pose = step.clip.canonical_hand(side)
+        return pose_steps(torch.cat([pose.global_orient[:, None], pose.hand_pose], dim=1), pose.wrist)
+
+    return _mean(one(side) for side in step.scene.sides)
+
+
+def joint_acceleration(step: Step) -> Tensor:
+    return _mean(acceleration(joints) for joints in step.joints.values())
+
+
+def object_acceleration(step: Step) -> Tensor:
+    if not step.has_object:
+        return torch.zeros(())
+    reach = step.scene.object_surface.verts.abs().amax()
+    corners = reach * torch.eye(3)
+    return acceleration(step.clip.object_points(corners))
+
+
+def orient_prior(step: Step) -> Tensor:
+    return _mean(squared_norm(poses.orient) for poses in step.scene.hand_poses.values())
+
+
+def pose_prior(step: Step) -> Tensor:
+    """Squared finger residuals of every frame, those of its grasp included."""
+    return _mean(
+        squared_norm(poses.pose + poses.pose_bias + step.scene.grasps[side].pose_residuals())
+        for side, poses in step.scene.hand_poses.items()
+    )
+
+
+def depth_prior(step: Step) -> Tensor:
+    """Squared relative distance from the depth that a frame outside grasps is expected to have."""
+
+    def one(side: Side) -> Tensor:
+        poses = step.scene.hand_poses[side]
+        away = step.clip.hand(side).wrist[:, 2].log() - poses.expected_log_depth
+        return (poses.has_expected_depth * away.square()).mean()
+
+    return _mean(one(side) for side in step.scene.sides)
+
+
+def betas_prior(step: Step) -> Tensor:
+    """Squared change of shape from the start, in the units of betas."""
+    return _mean(
+        squared_norm(step.scene.betas[side] - step.scene.base_betas[side]) for side in step.scene.betas
+    )
+
+
+def object_prior(step: Step) -> Tensor:
+    """Squared departure of the object's poses from their start, counted by how well each frame is known."""
+    return squared_norm(step.scene.object_poses.departures()) if step.has_object else torch.zeros(())
+
+
+def shade_prior(step: Step) -> Tensor:
+    """Squared shade of every frame: what one light for the clip explains is not for shade to explain."""
+    lighting = step.scene.lighting
+    return _mean([] if lighting is None else (squared_norm(shade) for shade in lighting.shade.values()))
+
+
+def rigid(step: Step) -> Tensor:
+    """A hand that holds the object moves with it: its joints stay where they are in the object's frame."""
+    if not step.has_object:
+        return torch.zeros(())
+
+    def one(side: Side) -> Tensor:
+        touching = step.evidence.touching[side]
+        joints = step.clip.in_object_frame(step.joints[side])
+        return velocity(joints, touching[1:] * touching[:-1])
+
+    return _mean(one(side) for side in step.scene.sides)
+
+
+def contact(step: Step) -> Tensor:
+    """Eq. 8, or its surface form; a mean over the hands."""
+    if not step.has_object:
+        return torch.zeros(())
+    if step.evidence.contact == "center":
+        centers = step.clip.object.centers
+        return _mean(
+            center_contact(centers, joints[:, 0], step.evidence.touching[side])
+            for side, joints in step.joints.items()
+        )
+    return _mean(
+        surface_contact(distances, step.evidence.touching[side])
+        for side, distances in step.object_distances.items()
+    )
+
+
+def penetrating(step: Step) -> Tensor:
+    if not step.has_object:
+        return torch.zeros(())
+    return _mean(penetration(distances) for distances in step.object_distances.values())
+
+
+# Terms of rendered images, which differ between the paper's two steps.
+IMAGE_TERMS: dict[str, dict[str, Callable[[Step], Tensor]]] = {
+    "single-subject": {
+        "image": image_alone,
+        "mse": mse_alone,
+        "ssim": ssim_alone,
+        "perceptual": perceptual_alone,
+        "mask": mask_alone,
+        "mask_random": mask_random_alone,
+        "coverage": coverage_alone,
+    },
+    "interacting-subjects": {
+        "image": image_together,
+        "mse": mse_together,
+        "ssim": ssim_together,
+        "perceptual": perceptual_together,
+        "mask": mask_together,
+        "spill": spill,
+        "mask_random": mask_random_together,
+        "labels": labels,
+    },
+}
+
+# Terms of the canonical subjects and of the poses.
+TERMS: dict[str, Callable[[Step], Tensor]] = {
+    "silhouette": silhouette,
+    "color": color,
+    "scale": scale,
+    "lbs": lbs,
+    "offset": offset,
+    "smooth": smooth,
+    "acceleration": joint_acceleration,
+    "object_acceleration": object_acceleration,
+    "orient_prior": orient_prior,
+    "pose_prior": pose_prior,
+    "depth_prior": depth_prior,
+    "betas_prior": betas_prior,
+    "object_prior": object_prior,
+    "shade_prior": shade_prior,
+    "rigid": rigid,
+    "contact": contact,
+    "penetration": penetrating,
+}

@@ -1,0 +1,217 @@
+"""The configuration of a run: frozen values that travel once, downward. Presets are in `presets.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bigs.models.hand_splats import HandSplatsConfig
+from bigs.models.object_splats import ObjectSplatsConfig
+from bigs.motion.tracker import TrackerConfig
+from bigs.raster.settings import RasterSettings
+from bigs.train.loop.density import DensifyConfig
+from bigs.train.start.completion import CompletionConfig
+from bigs.train.start.initial import InitialConfig
+
+Step = Literal["single-subject", "interacting-subjects"]
+
+
+@dataclass(frozen=True)
+class OptimizeStage:
+    """One stretch of gradient descent: what may move, what it is asked to satisfy, and for how long."""
+
+    name: str
+    # The paper's two steps: every subject rendered alone, or all together.
+    step: Step
+    steps: int
+    # Trainable groups (see `optim.GROUPS`) and their learning rates; a group that is not listed is frozen.
+    lrs: dict[str, float]
+    # Loss terms (see `terms.TERMS`) and their weights; a term that is not listed is not computed.
+    weights: dict[str, float]
+    # Long side in pixels to which this stage shrinks the clip's images; 0 keeps their size.
+    image_size: int = 0
+    # How many frames share one evaluation of the canonical fields; 0 takes the whole clip.
+    frames_per_step: int = 0
+    # Only the frames in which a hand holds nothing, each hand's own; those of its grasps stay as they are.
+    free_frames: bool = False
+    # A frame that a step does not look at keeps its turns and fingers, and their moments in the optimiser.
+    frame_moments: bool = False
+    # Learning rates fall along a cosine to this share.
+    final_lr: float = 0.1
+    # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
+    stop_patience: int = 0
+    stop_gain: float = 0.002
+    # The object's Gaussians are cloned, split and pruned meanwhile; None keeps them as many as they are.
+    densify: DensifyConfig | None = None
+
+
+@dataclass(frozen=True)
+class ScaleSearchStage:
+    """The object's size by a one-dimensional search: where do the touching hands touch?"""
+
+    name: str = "object-scale-search"
+    step: Step = "interacting-subjects"
+    # Relative sizes tried: `candidates` values evenly in 1 - span ... 1 + span.
+    span: float = 0.14
+    candidates: int = 29
+    # Contact cannot tell the object in front of a palm from the object behind it, occlusion can: the label
+    # term at this weight, this size and over this many frames.
+    labels_weight: float = 2.0
+    image_size: int = 100
+    frames: int = 12
+
+
+@dataclass(frozen=True)
+class GraspStage:
+    """Grasps: from here on the object carries a hand while it holds on (see `train.grasps.find`)."""
+
+    name: str = "grasps"
+    step: Step = "interacting-subjects"
+    # A frame outside grasps costs as much as one in a grasp whose squared error is this, in standard
+    # deviations; a grasp costs as much as a few frames outside, so that five frames can be one.
+    free: float = 3.0
+    grasp: float = 8.0
+    # Fewer frames than this are no grasp.
+    least: int = 4
+    # Nobody lets go and takes hold elsewhere in fewer frames than this: a sixth of a second.
+    gap: int = 5
+    # Where estimates have a hand, across the view and along it, as standard deviations per metre of distance:
+    # an outline tells the place to a few millimetres, and its size tells the distance to a few per cent.
+    error_aside: float = 0.007
+    error_along: float = 0.03
+    # Disagreement with the masks, in squared error per pixel of the hand beyond that of the frame's own
+    # estimate, that costs as much as a frame outside: about a third of the hand beside its mask.
+    excess: float = 0.4
+    # Long side in pixels at which masks are compared, and how often grasps are carried and cut anew.
+    image_size: int = 160
+    rounds: int = 2
+    # A hand that changes its grasp within so many frames turns evenly from one to the next.
+    longest_move: int = 16
+    # What a frame of a grasp may add of its own, as a factor on its residuals; 0 makes grasps rigid.
+    slack: float = 0.1
+
+
+@dataclass(frozen=True)
+class ObjectMotionStage:
+    """The object's motion from tracks in its pictures, found before anything is built on it.
+
+    See `motion.tracker`. It is the first stage of a plan that has it.
+    """
+
+    name: str = "object-motion"
+    step: Step = "single-subject"
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+
+
+@dataclass(frozen=True)
+class SplitStage:
+    """Fields are evaluated a last time, and Gaussians go on without them (see `models.free_gaussians`)."""
+
+    name: str = "split"
+    step: Step = "single-subject"
+    # Each Gaussian of the object becomes parts x parts smaller ones.
+    parts: int = 2
+    # Whether the hands, too, leave their field.
+    hands: bool = True
+    # Gaussians of the object less opaque than this are pruned.
+    least_opacity: float = 0.05
+
+
+# What is believed of the object's parts that no frame shows.
+PriorKind = Literal["off", "symmetry", "trained", "sd"]
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """What completes the object where it was never seen: each kind does what those before it do, and more.
+
+    `trained` is a file of bigs prior train, `sd` Stable Diffusion with what belongs to it.
+    """
+
+    kind: PriorKind = "off"
+    weights: str = ""  # the file, or Stable Diffusion's folder or hub name
+    object_name: str = "object"  # for Stable Diffusion's prompts
+    controlnet: str = ""  # folder or hub name of a soft-edge ControlNet
+    token: str = ""  # file of bigs prior fit
+    edge_weights: str = ""  # PiDiNet's file
+    completion: CompletionConfig = field(default_factory=CompletionConfig)
+
+
+@dataclass(frozen=True)
+class CompletionStage:
+    """The object's symmetries complete it where it was never seen (see `completed_scene`).
+
+    With the prior off there is no such stage.
+    """
+
+    name: str = "object-completion"
+    step: Step = "single-subject"
+    # The clip's own frames may come to show so much worse; beyond that all is undone.
+    most_worsening: float = 0.005
+
+
+@dataclass(frozen=True)
+class GuidanceStage:
+    """A diffusion prior completes the object where it was never seen (paper Eq. 7; see `guided`).
+
+    Without a prior's weights, or where the clip saw all of the object, there is no such stage.
+    """
+
+    name: str = "object-prior"
+    step: Step = "single-subject"
+    steps: int = 300
+    # Virtual views in a step, and their size in pixels.
+    views: int = 4
+    image_size: int = 64
+    # Learning rates: metres along the normal, and logarithms or logits.
+    lr_shift: float = 5e-4
+    lr_size: float = 0.01
+    lr_opacity: float = 0.02
+    lr_color: float = 0.05
+    # Weight of the evenness of neighbours' shifts.
+    smooth: float = 0.01
+    # Range of timesteps at the start and at the end, as shares of the prior's schedule.
+    t_first: tuple[float, float] = (0.5, 0.98)
+    t_last: tuple[float, float] = (0.02, 0.3)
+    # The stage is skipped when this share of the object was seen, and so are views of which this share was.
+    enough: float = 0.9
+    well_seen: float = 0.85
+    # What was seen may come to show so much worse, and the object may grow so much beyond its mask in any
+    # frame; beyond that all is undone.
+    damage: float = 0.02
+    # Weight by which the clip's frames hold what they show of the object as it was found, per pixel.
+    hold: float = 0.3
+    # A prior that says so much more wrongly what was seen than what it learned from does not know the object.
+    unlike: float = 1.2
+
+
+Stage = (
+    OptimizeStage
+    | ObjectMotionStage
+    | ScaleSearchStage
+    | GraspStage
+    | SplitStage
+    | CompletionStage
+    | GuidanceStage
+)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides the result of a run, apart from the clip and the hand model."""
+
+    seed: int = 0
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    hand: HandSplatsConfig = field(default_factory=HandSplatsConfig)
+    object: ObjectSplatsConfig = field(default_factory=ObjectSplatsConfig)
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    # Colours follow the direction a surface faces (see `models.lighting`); the paper's are fixed.
+    lighting: bool = True
+    # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
+    contact: Literal["center", "surface"] = "surface"
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
+    perceptual_weights: tuple[str, ...] = ()
+    stages: tuple[Stage, ...] = ()
+    # Steps between checkpoints within a stage; a stage's end is always saved.
+    checkpoint_every: int = 100

@@ -1,0 +1,354 @@
+"""Presets: configurations as values. `fast` and `full` go beyond the paper, `paper` is the paper's plan."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bigs.fields.triplane import TriplaneConfig
+from bigs.models.hand_splats import HandSplatsConfig
+from bigs.models.object_splats import ObjectSplatsConfig
+from bigs.train.loop.density import DensifyConfig
+from bigs.train.plan.config import (
+    CompletionStage,
+    GraspStage,
+    GuidanceStage,
+    ObjectMotionStage,
+    OptimizeStage,
+    PriorConfig,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+)
+from bigs.train.start.initial import InitialConfig
+
+# What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
+_POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.005}
+
+_HANDS_COARSE = OptimizeStage(
+    name="hands-coarse",
+    step="single-subject",
+    steps=60,
+    lrs={
+        "hand.orient": 0.02,
+        "hand.pose": 0.02,
+        "hand.pose_bias": 0.02,
+        "hand.ray": 0.006,
+        "hand.depth": 0.01,
+        "hand.betas": 0.03,
+    },
+    weights={"silhouette": 1.0, **_POSE_PRIORS},
+    image_size=60,
+    final_lr=0.5,
+)
+_HANDS_FINE = replace(
+    _HANDS_COARSE,
+    name="hands-fine",
+    steps=100,
+    lrs={
+        "hand.orient": 0.006,
+        "hand.pose": 0.008,
+        "hand.pose_bias": 0.008,
+        "hand.ray": 0.002,
+        "hand.depth": 0.003,
+        "hand.betas": 0.015,
+    },
+    weights={"silhouette": 1.0, **_POSE_PRIORS, "rigid": 0.03},
+    image_size=160,
+    final_lr=0.1,
+)
+# Grasps are known: what all frames of one agree on moves together.
+_GRASP_RATES = {"hand.grasp_orient": 0.006, "hand.grasp_pose": 0.008, "hand.grasp_position": 0.001}
+_HELD = replace(
+    _HANDS_FINE,
+    name="held",
+    steps=50,
+    lrs={**_HANDS_FINE.lrs, **_GRASP_RATES, "hand.betas": 0.01},
+    weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0},
+    final_lr=0.3,
+)
+_CONTACT = replace(
+    _HELD,
+    name="contact",
+    step="interacting-subjects",
+    weights={**_HELD.weights, "contact": 0.1, "penetration": 0.01},
+    final_lr=0.1,
+)
+_APPEARANCE = OptimizeStage(
+    name="appearance",
+    step="single-subject",
+    steps=60,
+    lrs={
+        "hand.triplane": 1e-2,
+        "hand.appearance": 2e-3,
+        "hand.skinning": 1e-4,
+        "hand.color": 1e-2,
+        "object.triplane": 1e-2,
+        "object.appearance": 2e-3,
+        "object.geometry": 5e-4,
+        "scene.light": 1e-2,
+        "scene.shade": 1e-2,
+    },
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0, "lbs": 1000.0},
+    image_size=240,
+    frames_per_step=6,
+)
+
+# Between grasps nothing carries a hand, and a few frames decide: many steps for them alone. Their depth is
+# read off the size of outlines, which must be right to a fraction of a per cent (see `evidence.INSET`).
+_REGRASP = OptimizeStage(
+    name="regrasp",
+    step="single-subject",
+    steps=90,
+    lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
+    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
+    image_size=160,
+    free_frames=True,
+)
+
+# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
+# have given shape and rough colours; from here on every Gaussian has parameters of its own (`SplitStage`).
+_JOINT = OptimizeStage(
+    name="joint",
+    step="interacting-subjects",
+    steps=150,
+    lrs={
+        "hand.orient": 0.005,
+        "hand.pose": 0.01,
+        "hand.ray": 0.0015,
+        "hand.depth": 0.0015,
+        "hand.grasp_orient": 0.003,
+        "hand.grasp_pose": 0.006,
+        "hand.grasp_position": 0.0005,
+        "hand.color": 0.03,
+        "hand.shift": 5e-5,
+        "hand.size": 0.005,
+        "hand.opacity": 0.01,
+        "object.color": 0.05,
+        "object.shift": 1e-4,
+        "object.size": 0.005,
+        "object.opacity": 0.01,
+        "object.orient": 0.002,
+        "object.ray": 0.0005,
+        "scene.light": 2e-3,
+        "scene.shade": 1e-2,
+        # Where fields are kept (--without split).
+        "hand.triplane": 1e-2,
+        "hand.appearance": 2e-3,
+        "hand.geometry": 1e-3,
+        "object.triplane": 1e-2,
+        "object.appearance": 2e-3,
+        "object.geometry": 1e-3,
+    },
+    weights={
+        "image": 4.0,
+        "mse": 30.0,
+        "spill": 4.0,
+        "labels": 0.5,
+        "silhouette": 4.0,
+        "scale": 100.0,
+        "offset": 0.02,
+        "shade_prior": 0.01,
+        **_POSE_PRIORS,
+        # Colours now say what the prior had to say before.
+        "pose_prior": 0.2,
+        "depth_prior": 12.0,
+        "rigid": 0.03,
+        "contact": 0.1,
+        "penetration": 0.01,
+        "object_acceleration": 0.005,
+        "object_prior": 0.1,
+    },
+    image_size=240,
+    frames_per_step=6,
+    frame_moments=True,
+)
+
+# The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.
+# Without the hands' silhouettes, which would take more time there than they are worth.
+_DETAIL = replace(
+    _JOINT,
+    name="detail",
+    steps=120,
+    lrs={
+        **_JOINT.lrs,
+        "hand.orient": 0.002,
+        "hand.pose": 0.004,
+        "hand.ray": 0.0005,
+        "hand.depth": 0.0005,
+        "hand.grasp_orient": 0.001,
+        "hand.grasp_pose": 0.002,
+        "hand.grasp_position": 0.0002,
+        "object.orient": 0.0007,
+        "object.ray": 0.0002,
+        # What is near enough to its place may now take its own shape and look quickly.
+        "hand.color": 0.06,
+        "hand.shift": 4e-4,
+        "hand.size": 0.15,
+        "hand.opacity": 0.15,
+        "object.color": 0.1,
+        "object.shift": 2e-4,
+        "object.size": 0.15,
+        "object.opacity": 0.15,
+    },
+    weights={
+        **{name: weight for name, weight in _JOINT.weights.items() if name != "silhouette"},
+        "mse": 300.0,
+        "spill": 25.0,
+    },
+    image_size=480,
+    frames_per_step=8,
+)
+
+FAST = RunConfig(
+    prior=PriorConfig("symmetry"),
+    stages=(
+        ObjectMotionStage(),
+        _HANDS_COARSE,
+        _HANDS_FINE,
+        ScaleSearchStage(),
+        GraspStage(),
+        _HELD,
+        _APPEARANCE,
+        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
+        GraspStage(name="grasps-2"),
+        _CONTACT,
+        _REGRASP,
+        SplitStage(),
+        _JOINT,
+        _DETAIL,
+        CompletionStage(),
+        GuidanceStage(),
+    ),
+)
+
+# For a little clip, in well under two minutes on two cores.
+DEMO = replace(
+    FAST,
+    stages=(
+        _HANDS_COARSE,
+        replace(_HANDS_FINE, steps=60),
+        ScaleSearchStage(),
+        GraspStage(),
+        replace(_HELD, steps=40),
+        replace(_APPEARANCE, steps=40),
+        GraspStage(name="grasps-2"),
+        replace(_CONTACT, steps=40),
+        replace(_REGRASP, steps=60),
+        SplitStage(),
+        replace(_JOINT, steps=110),
+        CompletionStage(),
+        GuidanceStage(steps=150),
+    ),
+)
+
+# More steps and finer images for whoever can wait a quarter of an hour.
+FULL = replace(
+    FAST,
+    hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
+    object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
+    stages=(
+        ObjectMotionStage(),
+        replace(_HANDS_COARSE, steps=100),
+        replace(_HANDS_FINE, steps=200),
+        ScaleSearchStage(),
+        GraspStage(),
+        replace(_HELD, steps=100),
+        replace(_APPEARANCE, steps=200),
+        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
+        GraspStage(name="grasps-2"),
+        replace(_CONTACT, steps=100),
+        replace(_REGRASP, steps=200),
+        SplitStage(),
+        replace(_JOINT, steps=300),
+        replace(_DETAIL, steps=1000, image_size=640),
+        CompletionStage(),
+        GuidanceStage(steps=600),
+    ),
+)
+
+# Seconds, for tests: every kind of stage, hardly any steps.
+SMOKE = replace(
+    FAST,
+    prior=PriorConfig(),
+    hand=replace(FAST.hand, subdivisions=0, triplane=TriplaneConfig(features=4, resolution=32)),
+    object=replace(FAST.object, n_gaussians=600, triplane=TriplaneConfig(features=4, resolution=32)),
+    initial=InitialConfig(surface_resolution=40),
+    stages=(
+        replace(_HANDS_COARSE, steps=25),
+        replace(_HANDS_FINE, steps=10, image_size=80),
+        ScaleSearchStage(candidates=15),
+        GraspStage(),
+        replace(_HELD, steps=8, image_size=80),
+        replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
+        replace(_CONTACT, steps=8, image_size=80),
+        replace(_REGRASP, steps=8, image_size=80),
+        SplitStage(),
+        # Too few steps for frames to get anywhere on their own.
+        replace(_JOINT, steps=12, image_size=80, frames_per_step=3, frame_moments=False),
+        replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),
+        CompletionStage(),
+        GuidanceStage(steps=4, views=2),
+    ),
+)
+
+# The paper as written: Eq. 4-6 alone for each subject, then Eq. 9 with Eq. 8, one frame a step at full size,
+# the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. L_vgg counts
+# when its network is given, and so does L_SDS (Eq. 7) with its prior's weights, for the object alone.
+_PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "color": 0.1, "scale": 100.0, "mask": 10.0}
+PAPER = RunConfig(
+    initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
+    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3, shape_error=0.0),
+    object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000),
+    lighting=False,
+    contact="center",
+    stages=(
+        OptimizeStage(
+            name="hands",
+            step="single-subject",
+            steps=15_000,
+            lrs={
+                "hand.triplane": 1e-3,
+                "hand.appearance": 1e-3,
+                "hand.geometry": 1e-3,
+                "hand.skinning": 1e-4,
+                "hand.orient": 1e-4,
+                "hand.pose": 1e-4,
+                "hand.ray": 1e-4,
+                "hand.depth": 1e-4,
+            },
+            weights={**_PAPER_IMAGE, "smooth": 1.0, "lbs": 1000.0},
+            frames_per_step=1,
+            final_lr=1.0,
+        ),
+        OptimizeStage(
+            name="object",
+            step="single-subject",
+            steps=30_000,
+            lrs={
+                "object.triplane": 1e-3,
+                "object.appearance": 1e-3,
+                "object.geometry": 1e-3,
+                "object.orient": 1e-4,
+                "object.ray": 1e-4,
+                "object.depth": 1e-4,
+            },
+            weights=_PAPER_IMAGE,
+            frames_per_step=1,
+            final_lr=1.0,
+            densify=DensifyConfig(),
+        ),
+        CompletionStage(),
+        GuidanceStage(steps=1000),
+        OptimizeStage(
+            name="translations",
+            step="interacting-subjects",
+            steps=30_000,
+            lrs={"hand.ray": 2e-3, "hand.depth": 2e-3},
+            weights={"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "mask": 10.0, "contact": 1.0},
+            frames_per_step=1,
+            final_lr=0.01,
+        ),
+    ),
+)
+
+PRESETS: dict[str, RunConfig] = {"smoke": SMOKE, "demo": DEMO, "fast": FAST, "full": FULL, "paper": PAPER}

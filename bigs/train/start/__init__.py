@@ -1,0 +1,1 @@
+"""Start values: smoothed estimates, the object's motion and surface, the scene."""

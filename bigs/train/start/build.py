@@ -1,0 +1,220 @@
+"""A scene at its start values: canonical hands, the object's surface and its Gaussians, smoothed poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.spatial
+import torch
+from torch import Tensor
+
+from bigs.data.base import Clip
+from bigs.geometry.distance import DistanceField
+from bigs.geometry.mesh import face_areas, sample_surface
+from bigs.geometry.support import Support, seen_samples
+from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.symmetry import Symmetry
+from bigs.hand import HandModel, shared_betas
+from bigs.models.hand_splats import HandSplats, HandSplatsConfig
+from bigs.models.lighting import Lighting
+from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
+from bigs.models.poses import HandPoses, ObjectPoses
+from bigs.models.scene import ObjectSurface, Scene
+from bigs.motion.tracker import TrackedMotion
+from bigs.train.start.carving import carve, convex_surface
+from bigs.train.start.completion import CompletionConfig, complete
+from bigs.train.start.initial import (
+    InitialConfig,
+    ObjectStart,
+    hand_in_camera,
+    object_in_camera,
+    smooth_hand,
+    smooth_object,
+)
+from bigs.train.start.object_motion import pose_errors, with_motion
+from bigs.types import Side
+
+
+class KnownPart(NamedTuple):
+    """What of the object's closed surface something speaks for."""
+
+    verts: Tensor  # [V] indices of its vertices
+    faces: Tensor  # [F, 3] among these
+    left_out: float  # share of the closed surface's area
+
+    def of(self, closed: ObjectSurface) -> ObjectSurface:
+        """That part of the closed surface, whose vertices may have moved."""
+        return ObjectSurface(closed.verts[self.verts], self.faces)
+
+
+class SceneStart(NamedTuple):
+    """A scene at its start values, and what there is to say about them."""
+
+    scene: Scene
+    skipped: list[str]  # what was not done, or replaced by something simpler, and why
+    symmetries: list[Symmetry]  # of the object, where they were looked for
+    known: KnownPart | None  # of the object's surface, if that is not all
+
+
+def build_scene(
+    clip: Clip,
+    unknown: np.ndarray,
+    hand_models: Mapping[Side, HandModel],
+    initial: InitialConfig,
+    hand: HandSplatsConfig,
+    obj: ObjectSplatsConfig,
+    lighting: bool,
+    completion: CompletionConfig | None = None,
+    motion: TrackedMotion | None = None,
+) -> SceneStart:
+    """A scene at its start values.
+
+    Args:
+        clip: the loaded clip.
+        unknown: [T, H, W] bool, unlabelled occluders (see `background`).
+        hand_models: both sides' models in their files' own conventions.
+        initial, hand, obj: see those classes.
+        lighting: whether colours depend on the direction a surface faces.
+        completion: where much of the object was never seen, its symmetries are looked for; if it has none,
+            hands meet nothing there. Otherwise, and without it, they meet the closed surface.
+        motion: of the object, if tracks were asked; it takes the place of the smoothed estimates.
+    """
+    starts = {
+        side: smooth_hand(
+            hand_in_camera(track, clip.cam_from_world, hand_models[side], initial), initial.smooth_hands
+        )
+        for side, track in clip.hands.items()
+    }
+    canonical = _canonical_hands(clip, hand_models, hand)
+    skipped: list[str] = []
+    symmetries: list[Symmetry] = []
+    known = None
+    object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
+    if clip.object is not None:
+        start = object_in_camera(clip, initial)
+        errors = None if motion is None else pose_errors(motion)
+        if motion is None:
+            start = smooth_object(start, initial.smooth_object)
+        else:
+            start = with_motion(start, motion)
+        surfaces = _object_surfaces(clip, unknown, start, initial, completion)
+        skipped, symmetries, known = surfaces.skipped, surfaces.symmetries, surfaces.known
+        verts, faces = surfaces.closed
+        points, normals = sample_surface(verts, faces, obj.n_gaussians)
+        object_parts = {
+            "object_splats": ObjectSplats(points, normals, _nearest_colors(points, start), obj),
+            "object_poses": ObjectPoses(start.rotations, start.centers, errors),
+            "object_surface": _as_surface(verts, faces),
+            "object_distance": DistanceField(surfaces.solid),
+        }
+    n_frames = len(clip)
+    present = [*clip.hands, *(["object"] if clip.object is not None else [])]
+    scene = Scene(
+        K=torch.as_tensor(clip.K, dtype=torch.float32),
+        width=clip.width,
+        height=clip.height,
+        hand_splats={side: HandSplats(model, hand) for side, (model, _) in canonical.items()},
+        betas={side: betas for side, (_, betas) in canonical.items()},
+        hand_poses={
+            side: HandPoses(start.global_orient, start.hand_pose, start.wrist)
+            for side, start in starts.items()
+        },
+        lighting=Lighting(present, n_frames) if lighting else None,
+        **object_parts,
+    )
+    return SceneStart(scene, skipped, symmetries, known)
+
+
+# A mesh that would lose less of its area is left closed.
+_LITTLE = 0.005
+
+
+def _as_surface(verts: np.ndarray, faces: np.ndarray) -> ObjectSurface:
+    return ObjectSurface(torch.as_tensor(verts, dtype=torch.float32), torch.as_tensor(faces.copy()))
+
+
+class _ObjectSurfaces(NamedTuple):
+    """The object's surface, for each use."""
+
+    closed: tuple[np.ndarray, np.ndarray]  # vertices and faces
+    known: KnownPart | None
+    solid: DistanceGrid  # what hands touch
+    symmetries: list[Symmetry]
+    skipped: list[str]
+
+
+def _object_surfaces(
+    clip: Clip,
+    unknown: np.ndarray,
+    start: ObjectStart,
+    initial: InitialConfig,
+    completion: CompletionConfig | None,
+) -> _ObjectSurfaces:
+    try:
+        carving = carve(clip, unknown, start, initial)
+        grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
+        closed = extract_mesh(grid)
+    except (ValueError, scipy.spatial.QhullError) as reason:
+        grid = convex_surface(start, initial)
+        closed = extract_mesh(grid)
+        why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
+        return _ObjectSurfaces(closed, None, grid, [], [why])
+    support = Support(
+        seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
+    )
+    verts, faces = support.known_part(*closed, initial.surface_kept)
+    left_out = 1.0 - face_areas(closed[0][verts], faces).sum() / face_areas(*closed).sum()
+    known = None
+    if left_out > _LITTLE:
+        known = KnownPart(torch.as_tensor(verts), torch.as_tensor(faces), left_out)
+    symmetries: list[Symmetry] = []
+    if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
+        symmetries = complete(carving, start, initial, completion).symmetries
+        if not symmetries:
+            grid = support.without_guesses(grid, initial.surface_solid)
+    return _ObjectSurfaces(closed, known, grid, symmetries, [])
+
+
+def _canonical_hands(
+    clip: Clip, models: Mapping[Side, HandModel], config: HandSplatsConfig
+) -> dict[Side, tuple[HandModel, Tensor]]:
+    """The right-handed model and start shape of each canonical hand."""
+    right = models["right"]
+    shapes: dict[Side, Tensor] = {}
+    for side, track in clip.hands.items():
+        betas = torch.as_tensor(track.betas, dtype=torch.float32)
+        shapes[side] = betas if side == "right" else shared_betas(right, models["left"], betas)
+    if not shapes:
+        return {}
+    if config.shared:
+        return {"right": (right, likely_shape(list(shapes.values()), config.shape_error))}
+    return {side: (right, likely_shape([betas], config.shape_error)) for side, betas in shapes.items()}
+
+
+def likely_shape(estimates: Sequence[Tensor], error: float) -> Tensor:
+    """The most likely betas [10] of one person given estimates of both hands, or of one.
+
+    The paper takes the right hand's; two independent estimates are better averaged, and as betas have unit
+    variance among people, an uncertain estimate lies too far out. How uncertain the mean is, both hands'
+    difference tells.
+
+    Args:
+        estimates: one or two shapes [10].
+        error: standard deviation of one estimate where there is no second; 0 takes estimates as they are.
+    """
+    mean = torch.stack(list(estimates)).mean(0)
+    if error == 0.0:
+        return mean
+    variance = error**2
+    if len(estimates) == 2:
+        variance = float((estimates[0] - estimates[1]).square().mean()) / 4.0
+    return mean / (1.0 + variance)
+
+
+def _nearest_colors(points: np.ndarray, start: ObjectStart) -> np.ndarray:
+    if start.colors is None:
+        return np.full((len(points), 3), 0.5)
+    _, index = scipy.spatial.cKDTree(start.points).query(points, k=min(3, len(start.points)))
+    return start.colors[index].reshape(len(points), -1, 3).mean(1)

@@ -1,0 +1,125 @@
+"""The object's surface at the start: what masks and points say, and how it is closed elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.spatial
+
+from bigs.checks import InputError
+from bigs.data.base import Clip
+from bigs.geometry.coverage import ObjectViews
+from bigs.geometry.surface import (
+    DistanceGrid,
+    VisualHull,
+    blend_with_points,
+    convex_distance,
+    empty_grid,
+    point_normals,
+    silhouette_around_points,
+)
+from bigs.train.start.initial import InitialConfig, ObjectStart
+from bigs.types import MASK_VALUES
+
+# Fewer points than this carry no surface.
+_MIN_POINTS = 30
+
+
+def usable_silhouettes(clip: Clip, start: ObjectStart) -> list[int]:
+    """Frames whose silhouette may carve the object: it is visible, and its pose was measured.
+
+    An interpolated pose carves what it should not; such frames serve only when there are hardly any others.
+    """
+    shown = [t for t in range(len(clip)) if clip.mask_areas["object"][t] > 0]
+    trusted = [t for t in shown if start.trust[t] == 1.0]
+    return trusted if len(trusted) >= min(len(shown), 5) else shown
+
+
+def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
+    """The fallback: the convex hull of the points.
+
+    Raises:
+        InputError: the points span no volume.
+    """
+    size = (start.points.max(0) - start.points.min(0)).max()
+    grid = empty_grid(
+        start.points.min(0) - 0.1 * size, start.points.max(0) + 0.1 * size, config.surface_resolution
+    )
+    try:
+        distance = convex_distance(grid.points(), start.points)
+    except scipy.spatial.QhullError:
+        raise InputError(
+            "entities.object: pts.cano: expected points that span a volume, "
+            f"found {len(start.points)} in a plane or fewer than four"
+        ) from None
+    return DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
+
+
+@dataclass(frozen=True)
+class Carving:
+    """What the clip's frames leave of the space around the object, and its points there."""
+
+    hull: DistanceGrid  # to the visual hull; right up to `InitialConfig.surface_reach`
+    shown: np.ndarray  # [X * Y * Z] share of the frames that show object there; 0 outside the hull's reach
+    points: np.ndarray  # [N, 3] metres, inside the silhouettes
+    normals: np.ndarray  # [N, 3] unit, outward
+    views: ObjectViews  # of the frames that count
+
+    def closed(
+        self, config: InitialConfig, points: np.ndarray, normals: np.ndarray, allowance: float
+    ) -> DistanceGrid:
+        """The surface through points [N, 3] with normals, within their convex hull or little more.
+
+        Beyond that hull only what nearly always shows as object stays, up to twice `allowance` metres: the
+        far side of an object that was never turned does, the space that a hand always covers does not.
+        """
+        distance = self.hull.values.ravel().copy()
+        doubtful = np.flatnonzero(distance < config.surface_reach)
+        beyond = convex_distance(self.hull.points()[doubtful], points) - config.surface_margin
+        relief = allowance * ((self.shown[doubtful] - config.surface_shown) / 0.1).clip(0.0)
+        distance[doubtful] = np.maximum(distance[doubtful], beyond - relief)
+        carved = DistanceGrid(distance.reshape(self.hull.values.shape), self.hull.origin, self.hull.spacing)
+        return blend_with_points(carved, points, normals, config.surface_reach)
+
+
+def carve(clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialConfig) -> Carving:
+    """The visual hull of the masks, and the points inside it.
+
+    `unknown` [T, H, W] (bool) marks unlabelled occluders.
+
+    Raises:
+        ValueError: masks and poses leave nothing of the object, or too few points to tell.
+    """
+    usable = usable_silhouettes(clip, start)
+    if not usable:
+        raise ValueError("no frame shows the object")
+    size = (start.points.max(0) - start.points.min(0)).max()
+    lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
+    grid = empty_grid(lower, upper, config.surface_resolution)
+    labels = np.stack([clip.mask(t) for t in usable])
+    rotations, centers = start.rotations[usable].numpy(), start.centers[usable].numpy()
+    # Whatever is not background may hide the object, so the object may be there.
+    allowed = (labels != 0) | unknown[usable]
+    silhouettes = [
+        silhouette_around_points(mask, start.points @ rotation.T + center, clip.K)
+        for mask, rotation, center in zip(allowed, rotations, centers, strict=True)
+    ]
+    agreeing = min(config.surface_agreeing, len(usable))
+    hull = VisualHull(np.stack(silhouettes), clip.K, rotations, centers, agreeing)
+    corners = grid.points()
+    distance = hull.distance(corners, stop=config.surface_reach)
+    points = start.points[hull.distance(start.points) < 0.25 * config.surface_reach]
+    if len(points) < _MIN_POINTS:
+        raise ValueError(f"only {len(points)} of {len(start.points)} points lie inside the silhouettes")
+    shown_here = labels == MASK_VALUES["object"]
+    shown = np.zeros(len(corners))
+    near = distance < config.surface_reach
+    shown[near] = hull.share_seen(corners[near], shown_here)
+    return Carving(
+        DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing),
+        shown,
+        points,
+        point_normals(points, hull.outward(points, 0.5 * grid.spacing)),
+        ObjectViews(shown_here, clip.K, rotations, centers),
+    )

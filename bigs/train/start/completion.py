@@ -1,0 +1,114 @@
+"""What a clip never showed of the object, by symmetry, where there is strong evidence for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.ndimage
+import scipy.spatial
+
+from bigs.geometry.coverage import times_empty
+from bigs.geometry.support import seen_samples
+from bigs.geometry.surface import DistanceGrid
+from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
+from bigs.train.start.carving import Carving
+from bigs.train.start.initial import InitialConfig, ObjectStart
+
+
+@dataclass(frozen=True)
+class CompletionConfig:
+    """When parts that were never seen are completed by symmetry. Lengths in metres."""
+
+    symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
+    # Nothing is completed when this share of the surface was seen.
+    enough: float = 0.9
+    # Seen surface speaks for a symmetry only this near to a point: elsewhere it may be the hull's alone.
+    measured: float = 0.008
+    # A carried point is new when it is further than this from all others.
+    gap: float = 0.003
+
+
+@dataclass(frozen=True)
+class Completion:
+    """The object's surface with what was added to it."""
+
+    surface: DistanceGrid
+    seen: float  # share of the surface that the clip shows
+    symmetries: list[Symmetry]
+    points: np.ndarray  # [M, 3] the added points, metres
+    colors: np.ndarray  # [M, 3]
+    why_not: str = ""  # why nothing was added
+
+    def __str__(self) -> str:
+        if not self.symmetries:
+            return self.why_not
+        kinds = [symmetry.kind for symmetry in self.symmetries]
+        names = {"plane": "mirror plane", "axis": "axis of revolution"}
+        found = ", ".join(
+            f"{kinds.count(kind)} {name}{'s' if kinds.count(kind) > 1 else ''}"
+            for kind, name in names.items()
+            if kind in kinds
+        )
+        return f"{found} found, {len(self.points)} points added where nothing was seen"
+
+
+# Of that tolerance the hull, which three frames agree on, takes this share.
+_OUTSIDE = 0.67
+
+
+def complete(
+    carving: Carving,
+    start: ObjectStart,
+    initial: InitialConfig,
+    config: CompletionConfig,
+    earlier: Sequence[Symmetry] = (),
+) -> Completion:
+    """The object's surface; where it was never seen, by its symmetries if it has any.
+
+    The search is a matter of seconds.
+
+    Args:
+        carving, start, initial, config: see those classes.
+        earlier: symmetries for which the evidence was strong before; they count if there is none now.
+    """
+    plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
+    points, normals, seen = seen_samples(carving.views, plain, initial.seen_frames, initial.seen_tolerance)
+    nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
+    if nothing.seen >= config.enough:
+        return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")
+    tree = scipy.spatial.cKDTree(start.points)
+    distance, nearest = tree.query(points)
+    measured = seen & (distance < config.measured)
+    colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
+    surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
+    is_empty = _empty_space(carving, surface, initial)
+    symmetries = find_symmetries(surface, is_empty, config.symmetry) or list(earlier)
+    if not symmetries:
+        return replace(nothing, why_not="no strong evidence for any")
+    known = SeenSurface(carving.points, carving.normals, colors[tree.query(carving.points)[1]])
+    whole = completed(known, symmetries, is_empty, config.gap)
+    # The points now stand all around the object, so nothing is beyond their convex hull.
+    grid = carving.closed(initial, whole.points, whole.normals, 0.0)
+    added = slice(len(known.points), None)
+    return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
+
+
+def _empty_space(carving: Carving, surface: SeenSurface, config: InitialConfig) -> IsEmpty:
+    """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
+    grid = carving.hull
+    corners = grid.points()
+    outside = grid.values.ravel()
+    near = np.flatnonzero(outside < config.seen_tolerance)
+    empty = np.ones(len(corners))
+    before = times_empty(carving.views, corners[near], surface.points, config.seen_tolerance)
+    empty[near] = (outside[near] > _OUTSIDE * config.seen_tolerance) | (before >= config.seen_frames)
+    volume = empty.reshape(grid.values.shape)
+
+    def is_empty(points: np.ndarray) -> np.ndarray:
+        place = ((points - grid.origin) / grid.spacing).T
+        return scipy.ndimage.map_coordinates(volume, place, order=1, mode="constant", cval=1.0) > 0.5
+
+    return is_empty

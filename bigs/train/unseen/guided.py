@@ -1,0 +1,213 @@
+"""The object's unseen Gaussians follow a diffusion prior (paper Eq. 7); what was seen stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.spatial
+import torch
+from torch import Tensor
+
+from bigs.geometry.coverage import coverage_by_direction, sphere_directions
+from bigs.guidance.cameras import (
+    Orbit,
+    VirtualCameras,
+    draw_directions,
+    view_weights,
+    virtual_cameras,
+)
+from bigs.guidance.denoiser import Conditions, Denoiser
+from bigs.guidance.schedule import SdsConfig
+from bigs.guidance.sds import sds_loss
+from bigs.models.object_detail import ObjectDetail
+from bigs.models.object_splats import CanonicalObject
+from bigs.raster import rasterization
+from bigs.raster.settings import RasterSettings
+from bigs.train.loop.run_stage import StageState
+from bigs.train.plan.config import GuidanceStage
+
+# Directions from which the object is looked at, before they are moved a little.
+_DIRECTIONS = 256
+_NEIGHBOURS = 8
+
+
+# Told the state after every step, and the loss.
+AfterStep = Callable[[StageState, float], None]
+# The loss by which the clip's frames hold the object as it was found; what it draws, it draws from there.
+Hold = Callable[[CanonicalObject, torch.Generator], Tensor]
+
+
+class Coverage(NamedTuple):
+    """How much of the object a clip has seen."""
+
+    seen: Tensor  # [N] bool, per Gaussian
+    directions: Tensor  # [D, 3] unit, object frame
+    by_direction: Tensor  # [D] in [0, 1]
+
+    @property
+    def share(self) -> float:
+        return float(self.seen.float().mean())
+
+
+def coverage_of(normals: Tensor, seen: Tensor) -> Coverage:
+    """The coverage of Gaussians with unit normals [N, 3], of which those marked in `seen` [N] were seen."""
+    directions = sphere_directions(_DIRECTIONS)
+    covered = coverage_by_direction(normals.numpy().astype(np.float64), seen.numpy(), directions)
+    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
+    return Coverage(seen, as_tensor(directions), as_tensor(covered))
+
+
+@dataclass(frozen=True)
+class Guided:
+    """What the prior did."""
+
+    moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
+    worst: float  # by what share the worst of the faults grew
+    rolled_back: bool
+
+
+def render_object(
+    canonical: CanonicalObject, cameras: VirtualCameras, size: int, settings: RasterSettings
+) -> Tensor:
+    """Pictures [B, 3, size, size] of the object alone, unlit, on white."""
+    out = rasterization(
+        canonical.means,
+        canonical.quats,
+        canonical.scales,
+        canonical.opacities,
+        canonical.colors,
+        cameras.viewmats,
+        cameras.K.expand(len(cameras.viewmats), 3, 3),
+        size,
+        size,
+        settings=settings,
+        backgrounds=torch.ones(len(cameras.viewmats), 3),
+    )
+    return out.colors.permute(0, 3, 1, 2)
+
+
+def guide_object(
+    detail: ObjectDetail,
+    coverage: Coverage,
+    orbit: Orbit,
+    denoiser: Denoiser,
+    stage: GuidanceStage,
+    settings: RasterSettings,
+    faults: Callable[[], Tensor],
+    hold: Hold | None = None,
+    seed: int = 0,
+    resume: Mapping[str, Any] | None = None,
+    after_step: AfterStep = lambda state, loss: None,
+) -> Guided:
+    """Optimise what was not seen of the object in place by score distillation from virtual cameras.
+
+    No gradient reaches a Gaussian that was seen. Unseen ones can still come to stand before seen ones, shine
+    through them, or leave the silhouette: `hold` speaks against that, and its faults are measured before and
+    after. All is undone if one of them grew more than the stage allows.
+
+    Args:
+        detail: the object's own Gaussians, as the stage found them.
+        coverage: which of them were seen; some were not.
+        orbit: where the virtual cameras stand.
+        denoiser: the prior.
+        stage: steps, rates, weights.
+        settings: of the renderer.
+        faults: [K] positive measures of how badly the object, as it is now, agrees with the clip.
+        hold: added to the prior's loss; see `Hold`.
+        seed: of views, timesteps and noise.
+        resume: steps done, moments, and what the Gaussians' parameters had become ("reached"), by name.
+        after_step: told the state after every step, and the loss.
+
+    Raises:
+        FloatingPointError: the prior's estimate is not finite.
+    """
+    sds = SdsConfig(stage.t_first, stage.t_last)
+    weights = view_weights(coverage.by_direction, stage.well_seen)
+    rates = {
+        "shift": stage.lr_shift,
+        "size": stage.lr_size,
+        "opacity": stage.lr_opacity,
+        "color": stage.lr_color,
+    }
+    parameters = {name: getattr(detail, name) for name in rates}
+    found = {name: value.detach().clone() for name, value in parameters.items()}
+    with torch.no_grad():
+        start = detail().means.clone()
+    unseen = ~coverage.seen
+    neighbours, spacing = _neighbours(start)
+    before = faults()
+    for parameter in parameters.values():
+        parameter.requires_grad_(True)
+    optimizer = torch.optim.Adam(
+        [{"params": [parameters[name]], "lr": lr} for name, lr in rates.items()], betas=(0.9, 0.99)
+    )
+    done = 0
+    if resume is not None:
+        done = resume["step"]
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
+        _fill(parameters, resume["reached"])
+    for step in range(done, stage.steps):
+        # A function of seed and step, so that a resumed run draws the same.
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+        directions = draw_directions(coverage.directions, weights, stage.views, generator)
+        cameras = virtual_cameras(orbit, directions, stage.image_size)
+        canonical = _freed(detail(), unseen)
+        images = render_object(canonical, cameras, stage.image_size, settings)
+        prior = sds_loss(
+            denoiser,
+            images,
+            Conditions(cameras.azimuths, cameras.elevations),
+            sds,
+            progress=step / stage.steps,
+            generator=generator,
+        )
+        # Neighbours move together, so that the surface stays one.
+        rough = (detail.shift - detail.shift[neighbours].mean(1)) / spacing
+        loss = prior + stage.smooth * rough[unseen].square().sum()
+        if hold is not None:
+            loss = loss + hold(canonical, generator)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for parameter in parameters.values():
+            parameter.grad[coverage.seen] = 0.0
+        optimizer.step()
+        after_step(StageState.begun(step + 1, optimizer, found), float(loss.detach()))
+    for parameter in parameters.values():
+        parameter.requires_grad_(False)
+    worst = float((faults() / before.clamp_min(1e-12)).max()) - 1.0
+    if worst > stage.damage:
+        _fill(parameters, found)
+        return Guided(torch.zeros_like(start), worst, True)
+    with torch.no_grad():
+        return Guided(detail().means - start, worst, False)
+
+
+@torch.no_grad()
+def _fill(parameters: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    for name, parameter in parameters.items():
+        parameter.copy_(values[name])
+
+
+def _freed(canonical: CanonicalObject, free: Tensor) -> CanonicalObject:
+    """The same Gaussians; gradients reach only those marked in `free` [N]."""
+    held = (
+        torch.where(free.reshape(-1, *[1] * (value.ndim - 1)), value, value.detach()) for value in canonical
+    )
+    return CanonicalObject(*held)
+
+
+def _neighbours(means: Tensor) -> tuple[Tensor, float]:
+    """The nearest others [N, K] of points [N, 3], and the median distance to the first, metres."""
+    distance, index = scipy.spatial.cKDTree(means.numpy()).query(means.numpy(), k=_NEIGHBOURS + 1)
+    return torch.as_tensor(index[:, 1:]), float(np.median(distance[:, 1]))
+
+
+def follow(verts: Tensor, means: Tensor, moved: Tensor) -> Tensor:
+    """A mesh's vertices [V, 3], moved as the Gaussians around them, at `means` [N, 3], by `moved` [N, 3]."""
+    distance, index = scipy.spatial.cKDTree(means.numpy()).query(verts.numpy(), k=_NEIGHBOURS)
+    weights = torch.as_tensor(1.0 / (distance + 1e-4), dtype=verts.dtype)
+    weights = weights / weights.sum(1, keepdim=True)
+    return verts + (weights[..., None] * moved[torch.as_tensor(index)]).sum(1)

@@ -1,0 +1,201 @@
+"""A diffusion prior on the object of a scene: what the clip saw of it, and what the prior may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
+from bigs.guidance.denoiser import Conditions, Denoiser
+from bigs.guidance.residual import picture_residual
+from bigs.models.object_detail import ObjectDetail, split_object
+from bigs.models.object_splats import CanonicalObject
+from bigs.models.scene import Scene
+from bigs.raster.settings import RasterSettings
+from bigs.train.loop.step import Evidence, Step
+from bigs.train.plan.config import GuidanceStage
+from bigs.train.unseen.completed_scene import CompletedScene
+from bigs.train.unseen.guided import (
+    AfterStep,
+    Coverage,
+    Hold,
+    coverage_of,
+    follow,
+    guide_object,
+    render_object,
+)
+from bigs.train.unseen.seen import (
+    SHOWS,
+    frames_seen,
+    guard_frames,
+    image_error,
+    object_views,
+    overflow,
+    weights_in_pictures,
+)
+
+# A Gaussian counts as seen when it shows in so many frames: fewer may be a fault of mask or pose.
+_LEAST_FRAMES = 3
+# Where one of those that have come to show is put back the next may show, so they are looked at again.
+_PASSES = 3
+# The pictures of so many frames are kept to hold the object by.
+_HOLDING_FRAMES = 60
+
+
+@torch.no_grad()
+def scene_coverage(scene: Scene, evidence: Evidence) -> tuple[Coverage, Orbit]:
+    """How much of the object's Gaussians the clip has seen, and the sphere from which the rest is looked at.
+
+    The front is where the clip's camera stood on average, and up is what was up in its pictures.
+    """
+    canonical = scene.object_splats()
+    frames = frames_seen(canonical, object_views(scene, evidence))
+    seen = torch.as_tensor(frames >= min(_LEAST_FRAMES, scene.n_frames))
+    pose = scene.at(torch.arange(scene.n_frames)).object
+    up = -pose.rotations[:, 1].mean(0)
+    towards = -(pose.rotations.transpose(-1, -2) @ pose.centers[..., None])[..., 0]
+    front = torch.nn.functional.normalize(towards, dim=-1).mean(0)
+    return coverage_of(canonical.normals, seen), make_orbit(canonical.means, up, front)
+
+
+def guide_scene(
+    scene: Scene,
+    evidence: Evidence,
+    denoiser: Denoiser,
+    stage: GuidanceStage,
+    seed: int,
+    resume: Mapping[str, Any] | None = None,
+    after_step: AfterStep = lambda state, loss: None,
+) -> CompletedScene:
+    """Let a prior complete the scene's object, in place; its surface follows its Gaussians.
+
+    Args:
+        scene: has an object.
+        evidence: the clip at the size at which the guard looks.
+        denoiser: the prior.
+        stage: see that class.
+        seed: of views, timesteps and noise.
+        resume: of an interrupted stage, as `checkpoint.load_checkpoint` returns it.
+        after_step: told the state after every step, and the loss.
+    """
+    scene.requires_grad_(False)
+    if not isinstance(scene.object_splats, ObjectDetail):
+        scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
+    detail = scene.object_splats
+    if resume is not None:
+        # What was seen, and how well it showed, is told by the object as the stage found it.
+        resume = {**resume, "reached": {name: getattr(detail, name).clone() for name in resume["found"]}}
+        detail.load_state_dict({**detail.state_dict(), **resume["found"]})
+    coverage, orbit = scene_coverage(scene, evidence)
+    facts = {"object seen before the prior": f"{coverage.share:.0%} of its Gaussians"}
+    if coverage.share >= stage.enough or not (coverage.by_direction < stage.well_seen).any():
+        return CompletedScene(f"{coverage.share:.0%} of the object was seen", facts)
+    with torch.no_grad():
+        canonical = detail()
+    strange = strangeness(canonical, coverage, orbit, denoiser, stage, evidence.settings)
+    if strange > stage.unlike:
+        reason = (
+            f"left out, since the prior knows no such object: about what was seen of it, it is {strange:.1f} "
+            f"times as wrong as about what it learned from ({stage.unlike} is allowed)"
+        )
+        return CompletedScene(reason, facts)
+    # What shows in any frame stays, even where too few show it to be sure of it.
+    held = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
+    if held.seen.all():
+        return CompletedScene("all of the object's Gaussians show", facts)
+    found = {name: value.clone() for name, value in detail.state_dict().items()}
+    some, every = guard_frames(scene.n_frames), torch.arange(scene.n_frames)
+
+    def faults() -> Tensor:
+        error = image_error(scene, evidence, ("object",), some)
+        return torch.cat([torch.tensor([error]), overflow(scene, evidence, every)])
+
+    done = guide_object(
+        detail,
+        held,
+        orbit,
+        denoiser,
+        stage,
+        evidence.settings,
+        faults,
+        held_by_frames(scene, evidence, canonical, stage.hold),
+        seed,
+        resume,
+        after_step,
+    )
+    if done.rolled_back:
+        reason = f"undone, since the clip's frames would show worse ({done.worst:+.1%} error or size)"
+        return CompletedScene(reason, facts)
+    _put_back(scene, evidence, detail, found, held.seen)
+    with torch.no_grad():
+        scene.surface_verts.copy_(follow(scene.surface_verts, canonical.means, done.moved))
+    moved = 1e3 * float(done.moved[~held.seen].norm(dim=-1).mean())
+    looked = float((coverage.by_direction < stage.well_seen).float().mean())
+    facts["prior"] = (
+        f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
+        f"error of what was seen {done.worst:+.1%} at most"
+    )
+    return CompletedScene(None, facts)
+
+
+def _put_back(
+    scene: Scene, evidence: Evidence, detail: ObjectDetail, found: Mapping[str, Tensor], held: Tensor
+) -> None:
+    """Give those Gaussians that were not `held` [N] and have come to show in a frame what they had before."""
+    free = ~held
+    for _ in range(_PASSES):
+        showing = free & (weights_in_pictures(scene, evidence) >= SHOWS)
+        if not showing.any():
+            return
+        for name, value in detail.state_dict().items():
+            value[showing] = found[name][showing]
+        free &= ~showing
+
+
+def strangeness(
+    canonical: CanonicalObject,
+    coverage: Coverage,
+    orbit: Orbit,
+    denoiser: Denoiser,
+    stage: GuidanceStage,
+    settings: RasterSettings,
+) -> float:
+    """How wrong a prior is about the sides that were seen, as a multiple of what it is on what it knows.
+
+    The sides that were seen are right, so a prior that believes in something else there is no help with the
+    others. 0 of a prior that does not say what it knows.
+    """
+    if denoiser.familiar is None:
+        return 0.0
+    best = coverage.by_direction.argsort(descending=True, stable=True)[: len(coverage.directions) // 10]
+    cameras = virtual_cameras(orbit, coverage.directions[best], stage.image_size)
+    with torch.no_grad():
+        images = render_object(canonical, cameras, stage.image_size, settings)
+    asked = Conditions(cameras.azimuths, cameras.elevations)
+    return picture_residual(denoiser, images, asked) / denoiser.familiar
+
+
+def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject, weight: float) -> Hold:
+    """The distance between what a frame shows of the object and what it showed of `canonical`.
+
+    Summed over the pixels in which nothing hides the object, if it is there; background counts.
+    """
+    frames = torch.linspace(0, scene.n_frames - 1, min(_HOLDING_FRAMES, scene.n_frames)).round().long()
+
+    def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
+        step = Step(scene, evidence, ("object",), {"object": now}, frames, with_labels=False)
+        shown = step.alone("object")
+        free = 1.0 - step.hidden_alone("object")
+        return free[..., None] * torch.cat([shown.colors, shown.alphas], dim=-1)
+
+    with torch.no_grad():
+        found = torch.cat([picture(canonical, frame) for frame in frames[:, None]])
+
+    def hold(now: CanonicalObject, generator: torch.Generator) -> Tensor:
+        chosen = torch.randint(len(frames), (1,), generator=generator)
+        return weight * (picture(now, frames[chosen]) - found[chosen]).abs().sum()
+
+    return hold

@@ -1,0 +1,88 @@
+"""What a clip has seen of a scene's object, in its poses as they are, and how well it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bigs.geometry.coverage import ObjectViews, times_seen
+from bigs.losses.photometric import masked_l1
+from bigs.models.object_splats import CanonicalObject
+from bigs.models.scene import Scene, concatenate
+from bigs.train.loop.step import Evidence, Step
+from bigs.types import Entity
+
+# Poses are wrong by about so much, metres.
+_TOLERANCE = 0.006
+# A Gaussian that weighs so much in some frame's picture, in pixels, shows.
+SHOWS = 0.002
+# Frames on which errors are measured.
+_GUARD_FRAMES = 12
+
+
+def object_views(scene: Scene, evidence: Evidence) -> ObjectViews:
+    """Where the object shows in each frame, in its own units: the camera's distance changes with its size."""
+    pose = scene.at(torch.arange(scene.n_frames)).object
+    shown = evidence.targets.shares["object"] > 0.5
+    centers = pose.centers / pose.scale
+    return ObjectViews(
+        shown.numpy(), evidence.targets.K.numpy(), pose.rotations.numpy(), centers.numpy().astype(np.float64)
+    )
+
+
+def frames_seen(canonical: CanonicalObject, views: ObjectViews) -> np.ndarray:
+    """In how many frames [N] each of the object's Gaussians shows."""
+    points = canonical.means.numpy().astype(np.float64)
+    return times_seen(views, points, canonical.normals.numpy(), points, _TOLERANCE)
+
+
+def guard_frames(n_frames: int) -> Tensor:
+    """Some frames of a clip, evenly spread."""
+    return torch.linspace(0, n_frames - 1, min(_GUARD_FRAMES, n_frames)).round().long()
+
+
+def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
+    """The most [N] that each of the object's Gaussians weighs in the picture of any frame, in pixels.
+
+    Colours are blended linearly, so the gradient of the summed picture is the weight, whatever hands and
+    nearer surface hide.
+    """
+    with torch.no_grad():
+        canonical = scene.canonical(scene.entities)
+    ink = torch.ones(len(canonical["object"].means), 1).requires_grad_()
+    most = torch.zeros(len(ink))
+    for frame in torch.arange(scene.n_frames)[:, None]:
+        step = Step(scene, evidence, scene.entities, canonical, frame, with_labels=False)
+        parts = []
+        for entity in scene.entities:
+            with torch.no_grad():
+                part = scene.at(frame).posed(entity, canonical[entity])
+            colors = ink[None] if entity == "object" else torch.zeros(1, len(part.opacities), 1)
+            parts.append(part._replace(colors=colors))
+        (weights,) = torch.autograd.grad(step.render(concatenate(parts)).colors.sum(), ink)
+        most = torch.maximum(most, weights[:, 0])
+    return most
+
+
+@torch.no_grad()
+def overflow(scene: Scene, evidence: Evidence, frames: Tensor) -> Tensor:
+    """How large the object's picture is in each of some frames [B]: 1 as its mask allows, more beyond it.
+
+    Where hands or something unlabelled may hide it, the mask allows everything.
+    """
+    step = Step(scene, evidence, ("object",), scene.canonical(("object",)), frames, with_labels=False)
+    hidden = step.hidden_alone("object")
+    beyond = (1.0 - hidden - step.share("object")).clamp_min(0.0)
+    outside = (beyond * step.alone("object").alphas[..., 0]).sum((1, 2))
+    return 1.0 + outside / step.share("object").sum((1, 2)).clamp_min(1.0)
+
+
+@torch.no_grad()
+def image_error(scene: Scene, evidence: Evidence, entities: Sequence[Entity], frames: Tensor) -> float:
+    """Mean absolute error of the colours where some entities, rendered together, show in the clip."""
+    step = Step(scene, evidence, tuple(entities), scene.canonical(entities), frames, with_labels=False)
+    shares = torch.stack([step.share(entity) for entity in entities]).sum(0).clamp(max=1.0)
+    return float(masked_l1(step.together.colors, step.images, shares))

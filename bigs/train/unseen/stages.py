@@ -1,0 +1,85 @@
+"""The stages that complete the object where no frame shows it, and what a run without a prior has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from bigs.data.base import Clip
+from bigs.geometry.symmetry import Symmetry
+from bigs.guidance.denoiser import Denoiser
+from bigs.models.scene import Scene
+from bigs.train.loop.evidence import EvidenceSource
+from bigs.train.loop.run_stage import StageState
+from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig
+from bigs.train.unseen.completed_scene import CompletedScene, complete_scene
+from bigs.train.unseen.guided_scene import guide_scene
+
+# The size at which the guard over what was seen looks.
+_OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
+
+
+def run_completion(
+    scene: Scene,
+    stage: CompletionStage,
+    sources: EvidenceSource,
+    config: RunConfig,
+    earlier: Sequence[Symmetry],
+) -> CompletedScene:
+    """Complete the object by its symmetries; see `complete_scene`."""
+    return complete_scene(
+        scene,
+        sources.clip,
+        sources.unknown,
+        sources.evidence(_OBSERVED_AT),
+        stage,
+        config.initial,
+        config.prior.completion,
+        config.object,
+        earlier,
+    )
+
+
+def run_guidance(
+    scene: Scene,
+    stage: GuidanceStage,
+    index: int,
+    sources: EvidenceSource,
+    config: RunConfig,
+    denoiser: Denoiser,
+    resume: dict[str, Any] | None,
+    keep: Callable[[int, StageState | None], None],
+    listen: Callable[[dict[str, Any]], None],
+) -> CompletedScene:
+    """Let a diffusion prior complete the object; see `guide_scene`. Its state is kept as of any stage."""
+
+    def after_step(state: StageState, loss: float) -> None:
+        progress = {"step": state.step, "steps": stage.steps, "loss": loss, "terms": {}, "seconds": 0.0}
+        listen({"event": "step", "stage": stage.name, "index": index, **progress})
+        if state.step % config.checkpoint_every == 0 and state.step < stage.steps:
+            keep(index, state)
+
+    evidence = sources.evidence(_OBSERVED_AT)
+    return guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, resume, after_step)
+
+
+def without_missing_prior(
+    config: RunConfig, clip: Clip, denoiser: Denoiser | None
+) -> tuple[RunConfig, str | None]:
+    """The configuration without the stages that the prior leaves nothing to do; what to tell the user."""
+    if config.prior.kind == "off":
+        config = _leave_out(config, CompletionStage)
+    if denoiser is not None:
+        asking = any(isinstance(stage, GuidanceStage) for stage in config.stages)
+        return config, None if asking else "prior: weights were given, but no stage of this plan uses them"
+    note = (
+        "prior: no diffusion; --prior-weights turns it on, with a FILE of bigs prior train "
+        "or a FOLDER of Stable Diffusion"
+    )
+    wanted = config.prior.kind != "off" and clip.object is not None
+    return _leave_out(config, GuidanceStage), note if wanted else None
+
+
+def _leave_out(config: RunConfig, kind: type) -> RunConfig:
+    return replace(config, stages=tuple(stage for stage in config.stages if not isinstance(stage, kind)))

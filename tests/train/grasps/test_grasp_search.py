@@ -1,0 +1,133 @@
+"""Cutting a clip into grasps: against every cut of a short one, and what faulty frames may do."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+
+import numpy as np
+import pytest
+
+from bigs.train.grasps.search import (
+    Prices,
+    certainties,
+    grasps_by_estimates,
+    grasps_by_frames,
+    still_costs,
+    stray_frames,
+)
+
+PRICES = Prices(free=3.0, grasp=8.0, least=4, gap=5)
+SIGMA = 0.005
+
+
+def seen(x: np.ndarray, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A hand of four points whose place moves along one axis, metres, seen along z where it is uncertain."""
+    rng = np.random.default_rng(2)
+    points = 0.05 * rng.standard_normal((1, 4, 3)) + x[:, None, None] * np.array([1.0, 0.0, 0.0])
+    points += noise * rng.standard_normal((len(x), 1, 3)) * np.array([1.0, 1.0, 4.0])
+    information = np.tile(np.diag([1.0, 1.0, 1.0 / 16.0]) / SIGMA**2, (len(x), 1, 1))
+    return points, information
+
+
+def places(*stretches: tuple[int, float]) -> np.ndarray:
+    """Still for some frames at each place, with 8 frames between them."""
+    parts = [np.full(stretches[0][0], stretches[0][1])]
+    for (_, a), (count, b) in pairwise(stretches):
+        parts += [np.linspace(a, b, 10)[1:-1] + 0.06 * np.sin(np.linspace(0, np.pi, 8)), np.full(count, b)]
+    return np.concatenate(parts)
+
+
+def test_costs_of_stretches_are_those_of_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((7, 3, 3))
+    roots = rng.standard_normal((7, 3, 3))
+    information = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    costs = still_costs(points, information)
+    for a, b in ((0, 7), (2, 5), (3, 4)):
+        total = 0.0
+        for k in range(3):
+            place = np.linalg.solve(
+                information[a:b].sum(0), np.einsum("tij,tj->i", information[a:b], points[a:b, k])
+            )
+            off = points[a:b, k] - place
+            total += np.einsum("ti,tij,tj->", off, information[a:b], off)
+        assert costs[a, b] == pytest.approx(total / 9, abs=1e-9)
+    assert np.isinf(costs[3, :4]).all()
+
+
+def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
+    """The least price of any cut, by trying every one."""
+    count = costs.shape[1]
+    best = prices.free * count
+    edges = range(count + 1)
+    for grasps in range(1, 4):
+        for cut in combinations(edges, 2 * grasps):
+            pairs = list(zip(cut[::2], cut[1::2], strict=True))
+            short = any(b - a < prices.least for a, b in pairs)
+            near = any(after[0] - before[1] < prices.gap for before, after in pairwise(pairs))
+            if short or near:
+                continue
+            inside = sum(min(c[a:b].sum() for c in costs) for a, b in pairs)
+            held = sum(b - a for a, b in pairs)
+            best = min(best, inside + prices.free * (count - held) + prices.grasp * grasps)
+    return best
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_cut_is_cheaper(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    costs = rng.gamma(0.7, 1.5, (2, 13))
+    prices = Prices(free=1.0, grasp=0.4, least=2, gap=2)
+    found = grasps_by_frames(costs, prices)
+    limited = np.minimum(costs, 2.5)
+    held = sum(len(frames) for frames, _ in found)
+    paid = sum(limited[h, frames].sum() for frames, h in found) + prices.grasp * len(found) + 13 - held
+    assert paid == pytest.approx(cheapest_of_all(limited, prices))
+    assert all(b.frames.start - a.frames.stop >= 2 for a, b in pairwise(found))
+
+
+def test_grasps_are_found_where_the_hand_stands_still() -> None:
+    points, information = seen(places((12, 0.0), (5, 0.05), (15, 0.02)), noise=0.001)
+    found = grasps_by_estimates(points, information, np.ones(len(points), bool), PRICES)
+    assert len(found) == 3, "five frames are enough"
+    for frames, (start, stop) in zip(found, ((0, 12), (20, 25), (33, 48)), strict=True):
+        assert abs(frames.start - start) <= 2 and abs(frames.stop - stop) <= 2
+
+
+def test_estimates_that_waver_along_the_view_are_one_grasp() -> None:
+    t = np.arange(60)
+    points, information = seen(np.zeros(60))
+    points = points + 0.015 * np.sin(t / 5)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    whole = [range(0, 60)]
+    assert grasps_by_estimates(points, information, np.ones(60, bool), PRICES) == whole
+    across = points[..., [2, 1, 0]]
+    assert grasps_by_estimates(across, information, np.ones(60, bool), PRICES) != whole
+
+
+def test_gross_errors_end_no_grasp() -> None:
+    points, information = seen(np.zeros(40), noise=0.001)
+    points[[7, 20, 21, 33]] += np.array([0.2, -0.1, 0.3])
+    assert np.flatnonzero(stray_frames(points, information)).tolist() == [7, 20, 21, 33]
+    assert grasps_by_estimates(points, information, np.ones(40, bool), PRICES) == [range(0, 40)]
+
+
+def test_a_hand_that_never_touches_holds_nothing() -> None:
+    points, information = seen(np.zeros(30))
+    assert grasps_by_estimates(points, information, np.zeros(30, bool), PRICES) == []
+    seldom = np.ones(30, bool)
+    seldom[13:16] = False
+    assert grasps_by_estimates(points, information, seldom, PRICES) == [range(0, 30)]
+
+
+def test_hypotheses_compete_for_frames() -> None:
+    costs = np.full((3, 40), 3.0)
+    costs[0, :18], costs[1, 5:9], costs[2, 26:] = 0.1, 0.05, 0.1
+    costs[0, 10:12] = 5.0
+    found = grasps_by_frames(costs, Prices(1.0, 2.0, 4, 5))
+    assert found == [(range(0, 18), 0), (range(26, 40), 2)], "two faulty frames are bridged"
+    assert grasps_by_frames(np.zeros((0, 40)), PRICES) == []
+
+
+def test_certainty_is_even_where_a_frame_could_as_well_be_free() -> None:
+    sure = certainties(np.array([0.0, 1.0, 2.0]), free=1.0)
+    assert sure[0] > 0.98 and sure[1] == 0.5 and sure[2] < 0.02

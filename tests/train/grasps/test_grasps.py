@@ -1,0 +1,231 @@
+"""Grasps: where they are found, what they tie together, and what they leave alone."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from toy_scenes import cube_scene
+
+from bigs.checks import InputError
+from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, rotation_angle
+from bigs.hand import mirror_rotation, procedural_hand
+from bigs.models.poses import HandFrames
+from bigs.models.scene import Scene
+from bigs.train.check_plan import check_plan
+from bigs.train.grasps.find import carried_errors, expected_depths, find_grasps, turned_between
+from bigs.train.loop.step import Step
+from bigs.train.loop.terms import depth_prior
+from bigs.train.plan.config import GraspStage, RunConfig
+from bigs.types import Side
+
+STAGE = GraspStage()
+FRAMES = 24
+
+
+def turning_scene(wander: float = 0.0) -> Scene:
+    """The held cube turning about the camera's vertical; the hands' estimates wander by `wander` metres."""
+    scene = cube_scene({side: procedural_hand(side) for side in ("right", "left")}, frames=FRAMES)
+    turn = torch.linspace(0, 2.0, FRAMES)
+    rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
+    noise = wander * torch.randn(FRAMES, 3, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        scene.object_poses.base_orient.copy_(rotations)
+        centers = scene.at(torch.arange(FRAMES)).object.centers
+        for side in scene.sides:
+            poses = scene.hand_poses[side]
+            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
+            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
+            poses.position.restart(centers + away + noise)
+    return scene
+
+
+def turning_copy(scene: Scene) -> Scene:
+    return copy.deepcopy(scene)
+
+
+EVERYWHERE = {"right": torch.ones(FRAMES), "left": torch.ones(FRAMES)}
+ALL = torch.arange(FRAMES)
+
+
+def test_the_object_carries_hands_that_hold_it() -> None:
+    scene = turning_scene(wander=0.0008)
+    truth = turning_scene()
+    found = find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    assert {side: grasps.stretches for side, grasps in found.items()} == {
+        "right": [range(0, FRAMES)],
+        "left": [range(0, FRAMES)],
+    }
+    for side in scene.sides:
+        joints = scene.at(ALL).in_object_frame(scene.at(ALL).joints(side))
+        assert (joints - joints[:1]).abs().max() < 1e-5, "still in the object's frame"
+        error = scene.at(ALL).joints(side) - truth.at(ALL).joints(side)
+        assert error.norm(dim=-1).max() < 0.0008, "a mean of 24 frames is nearer than any of them"
+
+
+def test_a_grasp_moves_as_one_and_a_frame_only_by_its_slack() -> None:
+    scene = turning_scene()
+    find_grasps(scene, GraspStage(slack=0.1), EVERYWHERE)
+    before = scene.at(ALL).joints("left")
+    with torch.no_grad():
+        scene.grasps["left"].position[0] += torch.tensor([0.01, 0.0, 0.0])
+    shift = scene.at(ALL).joints("left") - before
+    torch.testing.assert_close(shift.norm(dim=-1), torch.full((FRAMES, 21), 0.01), atol=1e-5, rtol=0)
+    with torch.no_grad():
+        scene.grasps["left"].position.zero_()
+        scene.hand_poses["left"].position.log_depth[3] = math.log(1.1) / 0.1
+    wrists = scene.at(ALL).joints("left")[:, 0]
+    ratio = wrists[:, 2] / before[:, 0, 2]
+    torch.testing.assert_close(ratio[3], torch.tensor(1.1), atol=1e-5, rtol=0)
+    torch.testing.assert_close(ratio[4:], torch.ones(FRAMES - 4), atol=1e-5, rtol=0)
+
+
+def test_finding_again_changes_nothing() -> None:
+    scene = turning_scene(wander=0.0008)
+    find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    before = {side: scene.at(ALL).joints(side) for side in scene.sides}
+    find_grasps(scene, GraspStage(slack=0.0), EVERYWHERE)
+    for side in scene.sides:
+        torch.testing.assert_close(scene.at(ALL).joints(side), before[side], atol=1e-5, rtol=0)
+
+
+def test_a_hand_that_holds_nothing_stays_where_it_was() -> None:
+    scene = turning_scene(wander=0.0008)
+    with torch.no_grad():
+        scene.hand_poses["right"].pose[:, 3, 2] = 0.2
+        scene.hand_poses["right"].pose_bias[4, 1] = 0.1
+    before = scene.at(ALL).joints("right")
+    found = find_grasps(scene, STAGE, {"right": torch.zeros(FRAMES), "left": torch.zeros(FRAMES)})
+    assert all(grasps.stretches == [] and not grasps.certainty.any() for grasps in found.values())
+    torch.testing.assert_close(scene.at(ALL).joints("right"), before, atol=1e-6, rtol=0)
+    assert not scene.hand_poses["right"].pose.any(), "residuals became the start"
+
+
+def test_pictures_give_a_grasp_the_frames_that_faulty_estimates_lost() -> None:
+    """The estimates stray for the last eight frames; carried there, the hand still fits its masks."""
+    scene, truth = turning_scene(), turning_scene()
+    lost = torch.arange(FRAMES) >= FRAMES - 8
+    wrong = 0.02 * torch.arange(FRAMES)[:, None] * lost[:, None]
+    true = truth.at(ALL).hand("right").wrist
+    with torch.no_grad():
+        scene.hand_poses["right"].position.restart(true + wrong)
+
+    def mismatch(side: Side, poses: HandFrames) -> torch.Tensor:
+        return (poses.wrist - truth.at(ALL).hand(side).wrist).norm(dim=-1) / 0.01
+
+    alone = find_grasps(copy.deepcopy(scene), STAGE, EVERYWHERE)["right"]
+    assert alone.stretches == [range(0, FRAMES - 8)]
+    found = find_grasps(scene, STAGE, EVERYWHERE, mismatch)["right"]
+    assert found.stretches == [range(0, FRAMES)]
+    assert found.certainty.min() > 0.85 and found.certainty[:8].min() > 0.95
+    assert found.text() == f"0-{FRAMES - 1} (95%)"
+    error = (scene.at(ALL).joints("right") - truth.at(ALL).joints("right")).norm(dim=-1)
+    assert error.max() < 0.002
+    torch.testing.assert_close(scene.grasps["right"].certainty, found.certainty)
+
+
+def test_pictures_drop_a_grasp_that_they_contradict() -> None:
+    scene = turning_scene()
+    touching = {"right": torch.ones(FRAMES), "left": torch.ones(FRAMES)}
+
+    def mismatch(side: Side, poses: HandFrames) -> torch.Tensor:
+        carried = not torch.equal(poses.wrist, scene.at(ALL).hand(side).wrist)
+        return torch.full((FRAMES,), 2.0 if carried and side == "left" else 0.02)
+
+    found = find_grasps(scene, STAGE, touching, mismatch)
+    assert found["left"].stretches == [] and found["right"].stretches == [range(0, FRAMES)]
+
+
+def test_a_hand_metres_away_holds_nothing() -> None:
+    """Carried through a turn it could end behind the camera."""
+    scene = turning_scene()
+    with torch.no_grad():
+        far = scene.at(ALL).hand("right").wrist + torch.tensor([0.0, 0.0, 30.0])
+        scene.hand_poses["right"].position.restart(far)
+    found = find_grasps(scene, STAGE, EVERYWHERE)
+    assert found["right"].stretches == [] and found["left"].stretches == [range(0, FRAMES)]
+
+
+def test_gradients_of_a_held_hand_reach_grasp_and_object() -> None:
+    scene = turning_scene()
+    find_grasps(scene, STAGE, EVERYWHERE)
+    scene.at(torch.tensor([2])).joints("right").square().sum().backward()
+    grasps = scene.grasps["right"]
+    for parameter in (grasps.orient, grasps.pose, grasps.position):
+        assert parameter.grad[0].abs().max() > 0 and not parameter.grad[1:].any()
+    assert scene.object_poses.orient.grad[2].abs().max() > 0
+    assert not scene.object_poses.orient.grad[3].any()
+
+
+def test_known_errors_are_carried_to_their_neighbours_and_fade_to_the_mean() -> None:
+    known = torch.zeros(60, dtype=torch.bool)
+    known[:10] = known[50:] = True
+    errors = torch.where(torch.arange(60) < 30, 1.0, -1.0)[:, None].repeat(1, 2)
+    carried = carried_errors(errors, known, noise=0.1)
+    assert carried[11].min() > 0.8 and carried[48].max() < -0.8
+    torch.testing.assert_close(carried[29] + carried[30], torch.zeros(2), atol=1e-4, rtol=0)
+    constant = carried_errors(torch.ones(60, 2), known, noise=0.1)
+    assert (constant - 1.0).abs().max() < 0.25, "what every known frame shows, all have"
+
+
+def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
+    held = torch.zeros(30, dtype=torch.bool)
+    held[:10] = held[20:] = True
+    true = torch.linspace(-0.5, -0.3, 30)
+    wave = 0.1 * torch.sin(torch.arange(30.0))
+    # An estimate that is wrong by the same everywhere, and one that wavers: half of its waver is believed.
+    for estimated, believed in ((true + 0.2, torch.zeros(30)), (true + 0.2 + wave * ~held, 0.5 * wave)):
+        expected = expected_depths(true, estimated, held)
+        torch.testing.assert_close(expected[~held], (true + believed)[~held], atol=0.02, rtol=0)
+
+
+def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
+    scene = cube_scene({"right": procedural_hand()})
+    step = Step(scene, None, (), {}, torch.arange(3))
+    poses = scene.hand_poses["right"]
+    assert depth_prior(step) == 0, "nothing is expected of anything yet"
+    with torch.no_grad():
+        poses.expected_log_depth[1] = poses.position.base_log_depth[1] + 0.1
+        poses.has_expected_depth[1] = True
+    loss = depth_prior(Step(scene, None, (), {}, torch.arange(3)))
+    torch.testing.assert_close(loss, torch.tensor(0.01 / 3 / len(scene.sides)))
+    loss.backward()
+    gradient = poses.position.log_depth.grad
+    assert gradient[1] < 0 and gradient.isfinite().all() and not gradient[[0, 2]].any()
+
+
+def test_a_hand_turns_evenly_from_grasp_to_grasp_as_seen_from_the_object() -> None:
+    carrier = axis_angle_to_matrix(torch.linspace(0, 1, 20)[:, None] * torch.tensor([0.3, 1.0, 0.2]))
+    turn = torch.tensor([0.0, 0.0, 1.2])
+    held = [range(0, 6), range(15, 20)]
+    relative = torch.eye(3).repeat(20, 1, 1)
+    relative[15:] = axis_angle_to_matrix(turn)
+    wrong = relative.clone()
+    wrong[6:15] = axis_angle_to_matrix(torch.tensor([2.0, 0.0, 0.0]))
+    orient = turned_between(carrier @ wrong, carrier, held, 16)
+    angles = rotation_angle(carrier.transpose(-1, -2) @ orient)
+    torch.testing.assert_close(angles[[0, 5]], torch.zeros(2), atol=1e-3, rtol=0)
+    torch.testing.assert_close(angles[15:], torch.full((5,), 1.2), atol=1e-3, rtol=0)
+    steps = angles[5:16].diff()
+    assert (steps > 0).all() and steps[[0, -1]].max() < 0.3 * steps.max(), "slow, fast, slow"
+    untouched = turned_between(carrier @ wrong, carrier, held, 8)
+    torch.testing.assert_close(untouched, carrier @ wrong)
+
+
+def test_a_robust_mean_ignores_a_minority() -> None:
+    generator = torch.Generator().manual_seed(0)
+    good = axis_angle_to_matrix(0.02 * torch.randn(9, 3, generator=generator))
+    bad = axis_angle_to_matrix(torch.tensor([[2.0, 0.0, 0.0]])).repeat(3, 1, 1)
+    mean = robust_mean_rotation(torch.cat([good, bad]))
+    assert rotation_angle(mean) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("free", 0.0), ("least", 1), ("slack", -0.1), ("gap", -1), ("longest_move", -1), ("excess", 0.0)],
+)
+def test_thresholds_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"stages.grasps.{name}"):
+        check_plan(RunConfig(stages=(GraspStage(**{name: value}),)))

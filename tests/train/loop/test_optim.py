@@ -1,0 +1,121 @@
+"""Trainable groups: together they are the whole scene, each parameter in exactly one."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_scenes import cube_scene
+
+from bigs.checks import InputError
+from bigs.data.base import Clip
+from bigs.hand import HandModel
+from bigs.models.scene import Scene
+from bigs.train.loop.optim import FIELD_GROUPS, GROUPS, group_parameters, make_optimizer, set_cosine_rates
+from bigs.train.plan.presets import SMOKE
+from bigs.train.start.build import build_scene
+from bigs.types import Side
+
+
+def assert_partition(scene: Scene) -> None:
+    names = {id(p): name for name, p in scene.named_parameters()}
+    seen = Counter(names[id(p)] for group in GROUPS for p in group_parameters(scene, group))
+    assert seen == Counter(names.values())
+
+
+def test_groups_partition_the_parameters(both_hands: dict[Side, HandModel]) -> None:
+    assert_partition(cube_scene(both_hands))
+
+
+@pytest.mark.parametrize("case", ["one hand", "no object", "no light", "two canonical hands"])
+def test_groups_partition_the_parameters_of_any_clip(
+    case: str, tiny: Clip, both_hands: dict[Side, HandModel]
+) -> None:
+    hand = SMOKE.hand
+    if case == "one hand":
+        tiny = replace(tiny, hands={"left": tiny.hands["left"]})
+    if case == "no object":
+        tiny = replace(tiny, object=None)
+    if case == "two canonical hands":
+        hand = replace(hand, shared=False)
+    unknown = torch.zeros(len(tiny), tiny.height, tiny.width, dtype=torch.bool).numpy()
+    scene = build_scene(
+        tiny, unknown, both_hands, SMOKE.initial, hand, SMOKE.object, case != "no light"
+    ).scene
+    assert_partition(scene)
+    assert len(scene.hand_splats) == (2 if case == "two canonical hands" else 1)
+
+
+def test_field_groups_are_what_a_canonical_subject_depends_on(both_hands: dict[Side, HandModel]) -> None:
+    scene = cube_scene(both_hands)
+    for subject, splats in (("hand", scene.hand_splats), ("object", scene.object_splats)):
+        grouped = {id(p) for group in FIELD_GROUPS[subject] for p in group_parameters(scene, group)}
+        assert grouped == {id(p) for p in splats.parameters()}
+
+
+def test_an_unknown_group_is_named(both_hands: dict[Side, HandModel]) -> None:
+    with pytest.raises(InputError, match=r"expected one of .* groups, found 'hand\.rays'"):
+        make_optimizer(cube_scene(both_hands), {"hand.rays": 0.1})
+
+
+def test_only_listed_groups_require_gradients(both_hands: dict[Side, HandModel]) -> None:
+    scene = cube_scene(both_hands)
+    make_optimizer(scene, {"hand.ray": 0.1, "object.scale": 0.2, "scene.light": 0.3})
+    trainable = {name for name, p in scene.named_parameters() if p.requires_grad}
+    assert trainable == {
+        "hand_poses.right.position.ray",
+        "hand_poses.left.position.ray",
+        "object_poses.log_scale",
+        "lighting.clip",
+    }
+
+
+def test_rates_fall_along_a_cosine(both_hands: dict[Side, HandModel]) -> None:
+    optimizer = make_optimizer(cube_scene(both_hands), {"hand.ray": 0.5, "hand.depth": 2.0})
+    for progress, share in ((0.0, 1.0), (0.5, 0.55), (0.25, 0.1 + 0.45 * (1 + math.sqrt(0.5))), (1.0, 0.1)):
+        set_cosine_rates(optimizer, progress, 0.1)
+        rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
+        assert rates == pytest.approx({"hand.ray": 0.5 * share, "hand.depth": 2.0 * share})
+
+
+def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side, HandModel]) -> None:
+    scene = cube_scene(both_hands)
+    optimizer = make_optimizer(
+        scene, {"hand.pose": 0.1, "hand.depth": 0.1, "object.orient": 0.1}, frame_moments=True
+    )
+    turns, depths = scene.hand_poses["right"].pose, scene.hand_poses["right"].position.log_depth
+    others = list(range(1, scene.n_frames))
+
+    def step(frame: int) -> None:
+        optimizer.zero_grad(set_to_none=True)
+        # As a prior over time has it, every frame has a gradient.
+        (turns.sum() + depths.sum() + scene.object_poses.orient.sum()).backward()
+        optimizer.step_frames(torch.tensor([frame]))
+
+    step(0)
+    assert torch.all(turns[0] == -turns[0].abs()) and torch.all(turns[0] != 0)
+    assert torch.all(turns[others] == 0) and torch.all(scene.object_poses.orient[others] == 0)
+    assert torch.all(optimizer.state[turns]["exp_avg"][others] == 0)
+    # Depths go on with every step.
+    assert torch.all(depths != 0)
+
+    first, moments = turns[0].clone(), optimizer.state[turns]["exp_avg_sq"][0].clone()
+    step(1)
+    assert torch.equal(turns[0], first) and torch.equal(optimizer.state[turns]["exp_avg_sq"][0], moments)
+    assert torch.all(turns[1] != 0)
+
+
+def test_a_step_on_all_frames_is_plain_adam(both_hands: dict[Side, HandModel]) -> None:
+    poses = []
+    for step_all in (True, False):
+        scene = cube_scene(both_hands)
+        optimizer = make_optimizer(scene, {"hand.pose": 0.1}, frame_moments=True)
+        for _ in range(3):
+            optimizer.zero_grad(set_to_none=True)
+            (scene.hand_poses["right"].pose - 1.0).square().sum().backward()
+            optimizer.step_frames(torch.arange(scene.n_frames)) if step_all else optimizer.step()
+        poses.append(scene.hand_poses["right"].pose.detach())
+    assert torch.equal(*poses) and torch.all(poses[0] != 0)

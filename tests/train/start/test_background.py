@@ -1,0 +1,104 @@
+"""Unlabelled occluders: a sleeve before a still background is found, and nothing is made up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from toy_clips import painted_clip
+
+from bigs.train.start.background import unknown_occluders
+
+FRAMES, HEIGHT, WIDTH = 9, 60, 80
+
+
+def room(rng: np.random.Generator, width: int = WIDTH) -> np.ndarray:
+    """A background with structure, [H, W, 3] in [0, 1]."""
+    blocks = scipy.ndimage.gaussian_filter(rng.normal(size=(HEIGHT, width, 3)), (2, 2, 0))
+    return 0.5 + 0.15 * blocks / blocks.std()
+
+
+def to_bytes(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """With a sensor's noise."""
+    noisy = images + rng.normal(0, 1.5 / 255, images.shape)
+    return (255 * noisy.clip(0, 1)).round().astype(np.uint8)
+
+
+def moving_box(top: int, left: int, height: int, width: int, step: int) -> np.ndarray:
+    """[T, H, W] bool: a box that moves right."""
+    box = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=bool)
+    for t in range(FRAMES):
+        box[t, top : top + height, left + step * t : left + step * t + width] = True
+    return box
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_finds_a_moving_sleeve(tmp_path: Path, rng: np.random.Generator) -> None:
+    hand, sleeve = moving_box(25, 5, 12, 12, 5), moving_box(37, 5, 14, 12, 5)
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[hand] = [0.8, 0.6, 0.5]
+    images[sleeve] = [0.1, 0.15, 0.9]
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    found = unknown_occluders(clip)
+    assert found.shape == (FRAMES, HEIGHT, WIDTH) and found.dtype == bool
+    assert found[sleeve].mean() > 0.95
+    assert not found[hand].any()
+    near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 7, 7)))
+    assert found[~near].mean() < 0.005
+
+
+def test_a_still_clip_has_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    hand = moving_box(25, 5, 12, 12, 5)
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[hand] = [0.8, 0.6, 0.5]
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    assert not unknown_occluders(clip).any()
+
+
+def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
+    wide = room(rng, WIDTH + 12 * FRAMES)
+    images = np.stack([wide[:, 12 * t : 12 * t + WIDTH] for t in range(FRAMES)])
+    hand = moving_box(25, 5, 12, 12, 1)
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    assert not unknown_occluders(clip).any()
+
+
+def test_border_pixels_of_a_mask_are_no_occluder(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Masks are cut sharp, images are not: one mixed pixel around a moving hand is nothing."""
+    hand = moving_box(20, 5, 20, 20, 4)
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    rim = scipy.ndimage.binary_dilation(hand, scipy.ndimage.generate_binary_structure(2, 1)[None]) & ~hand
+    images[rim] = 0.5 * images[rim] + 0.5 * np.array([1.0, 0.0, 0.0])
+    images[hand] = [1.0, 0.0, 0.0]
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    assert unknown_occluders(clip).mean() < 0.002
+
+
+def test_rows_that_are_never_background(tmp_path: Path, rng: np.random.Generator) -> None:
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    masks = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=np.uint8)
+    masks[:, 10:14] = 50
+    assert not unknown_occluders(painted_clip(tmp_path / "a", to_bytes(images, rng), masks)).any()
+    masks[:] = 50
+    assert not unknown_occluders(painted_clip(tmp_path / "b", to_bytes(images, rng), masks)).any()
+
+
+def test_large_images_are_compared_smaller(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Above 320 pixels the comparison is coarse, the answer is not."""
+    scale = 7
+    sleeve = moving_box(20, 5, 20, 16, 6)
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[sleeve] = [0.1, 0.15, 0.9]
+    large = to_bytes(images, rng).repeat(scale, axis=1).repeat(scale, axis=2)
+    clip = painted_clip(tmp_path, large, np.zeros(large.shape[:3], np.uint8))
+    found = unknown_occluders(clip)
+    assert found.shape == large.shape[:3]
+    inside = sleeve.repeat(scale, axis=1).repeat(scale, axis=2)
+    assert found[inside].mean() > 0.95
+    assert found[~inside].mean() < 0.1

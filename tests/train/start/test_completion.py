@@ -1,0 +1,135 @@
+"""Completion by symmetry of clips that show one side of their object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from limited_view import bottle_clip, limited_view
+
+from bigs.data.base import Clip
+from bigs.geometry.distance import DistanceField
+from bigs.geometry.support import seen_samples
+from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.hand import HandModel
+from bigs.metrics.align import similarity_icp
+from bigs.metrics.shape import ShapeScore
+from bigs.train.plan.presets import SMOKE
+from bigs.train.start.build import build_scene
+from bigs.train.start.carving import Carving, carve
+from bigs.train.start.completion import Completion, CompletionConfig, complete
+from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
+from bigs.types import HandObjectTrajectory, Side
+
+INITIAL = InitialConfig(surface_resolution=56)
+
+
+@pytest.fixture(scope="module")
+def bottle(
+    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
+) -> tuple[Clip, HandObjectTrajectory]:
+    return bottle_clip(tmp_path_factory.mktemp("bottle") / "clip", both_hands)
+
+
+@pytest.fixture(scope="module")
+def one_side(bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, Carving, ObjectStart]:
+    clip = limited_view(*bottle, range(12))
+    start = smooth_object(object_in_camera(clip, INITIAL), 2.0)
+    return clip, carve(clip, nothing_hides(clip), start, INITIAL), start
+
+
+def nothing_hides(clip: Clip) -> np.ndarray:
+    return np.zeros((len(clip), clip.height, clip.width), dtype=bool)
+
+
+def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
+    verts, faces = extract_mesh(surface)
+    return similarity_icp(verts, truth.object_verts[0], faces, truth.object_faces).score
+
+
+@pytest.mark.slow
+def test_the_unseen_side_comes_nearer_to_the_truth(
+    one_side: tuple[Clip, Carving, ObjectStart], bottle: tuple[Clip, HandObjectTrajectory]
+) -> None:
+    _, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig())
+    assert found.seen < 0.7
+    assert found.symmetries and len(found.points) == len(found.colors) > 100
+    before = score(carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach), bottle[1])
+    after = score(found.surface, bottle[1])
+    assert after.chamfer.squared < 0.8 * before.chamfer.squared
+    assert after.f5 > before.f5 and after.f10 >= before.f10
+
+
+def test_a_symmetry_found_at_the_start_leaves_what_hands_meet(
+    one_side: tuple[Clip, Carving, ObjectStart], both_hands: dict[Side, HandModel]
+) -> None:
+    clip, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig())
+    plan = (clip, nothing_hides(clip), both_hands, INITIAL, SMOKE.hand, SMOKE.object, False)
+    built, plain = build_scene(*plan, CompletionConfig()), build_scene(*plan)
+    assert len(built.symmetries) == len(found.symmetries) > 0 and not plain.symmetries
+    solid = built.scene.object_distance.values
+    assert torch.equal(solid, plain.scene.object_distance.values)
+    assert not torch.equal(solid, DistanceField(found.surface).values)
+
+
+def test_symmetries_found_earlier_count_if_there_are_none_now(
+    one_side: tuple[Clip, Carving, ObjectStart],
+) -> None:
+    _, carving, start = one_side
+    base = CompletionConfig()
+    found = complete(carving, start, INITIAL, base)
+    strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
+    again = complete(carving, start, INITIAL, strict, found.symmetries)
+    assert again.symmetries == found.symmetries
+    np.testing.assert_array_equal(again.surface.values, found.surface.values)
+
+
+def test_less_counts_as_seen_the_more_frames_must_show_it(
+    one_side: tuple[Clip, Carving, ObjectStart],
+) -> None:
+    _, carving, _ = one_side
+    surface = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
+    shares = [seen_samples(carving.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
+    assert shares[0] > shares[1] > shares[2] > 0.0
+    assert seen_samples(carving.views, surface, 3, 0.0).seen.mean() < shares[1]
+
+
+def test_weak_evidence_changes_nothing(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
+    _, carving, start = one_side
+    base = CompletionConfig()
+    strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
+    found = complete(carving, start, INITIAL, strict)
+    plain = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
+    assert "no strong evidence" in str(found)
+    np.testing.assert_array_equal(found.surface.values, plain.values)
+
+
+def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
+    _, carving, start = one_side
+    found = complete(carving, start, INITIAL, CompletionConfig(enough=0.05))
+    assert not found.symmetries and "of the object's surface was seen" in str(found)
+
+
+def test_the_description_counts_kinds() -> None:
+    from bigs.geometry.symmetry import Symmetry
+
+    plane = Symmetry("plane", np.zeros(3), np.eye(3)[0])
+    axis = Symmetry("axis", np.zeros(3), np.eye(3)[0])
+    grid = DistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 1.0)
+    found = Completion(grid, 0.5, [plane, axis, plane], np.zeros((7, 3)), np.zeros((7, 3)))
+    text = "2 mirror planes, 1 axis of revolution found, 7 points added where nothing was seen"
+    assert str(found) == text
+
+
+def test_the_command_line_names_the_kinds(tmp_path: Path) -> None:
+    from typing import get_args
+
+    from bigs.cli.runs import Prior
+    from bigs.train.plan.config import PriorKind
+
+    assert set(get_args(Prior)) == {"auto", *get_args(PriorKind)}
