@@ -11,7 +11,7 @@ import pytest
 from bigs.cli.app import COMMANDS
 
 ROOT = Path(__file__).parents[1]
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 NAMED = re.compile(r"`(bigs(?:\.\w+)+)")
 
 
