@@ -46,3 +46,10 @@ def test_commands_exist(page: Path) -> None:
     for block in re.findall(r"^```.*?^```", page.read_text(), re.M | re.S):
         for name in re.findall(r"^bigs ([a-z]+)", block, re.M):
             assert name in COMMANDS, name
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda page: page.stem)
+def test_files_of_the_repository_exist(page: Path) -> None:
+    """Paths are given from the root of the repository or from `bigs`."""
+    for path in re.findall(r"`((?:[a-z][\w-]*/)+[\w-]+\.(?:py|rs))\b", page.read_text()):
+        assert (ROOT / path).exists() or (ROOT / "bigs" / path).exists(), path
