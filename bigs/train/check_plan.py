@@ -7,7 +7,7 @@ from itertools import pairwise
 from bigs.checks import InputError, check_choice
 from bigs.train.loop.density import DensifyConfig
 from bigs.train.loop.optim import GROUPS
-from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.loop.terms import terms_of
 from bigs.train.plan.config import (
     CompletionStage,
     GuidanceStage,
@@ -59,10 +59,9 @@ def check_plan(config: RunConfig) -> None:
 
 
 def _check_names(where: str, stage: OptimizeStage) -> None:
-    accepted = (*IMAGE_TERMS[stage.step], *TERMS)
-    for kind, given, known in (("groups", stage.lrs, GROUPS), ("terms", stage.weights, accepted)):
-        for name in given:
-            check_choice(where, name, known, kind)
+    for group in stage.lrs:
+        check_choice(where, group, GROUPS, "groups")
+    terms_of(stage, where)
 
 
 def _check_densify(

@@ -14,7 +14,7 @@ from bigs.models.hand_splats import CanonicalHand, silhouette_hand
 from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
-from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.targets import Targets, crop_box, load_targets
 from bigs.train.loop.terms import labels
 from bigs.train.plan.config import GraspStage, RunConfig, ScaleSearchStage, Stage
@@ -86,13 +86,13 @@ class EvidenceSource:
         entities = self.scene.entities
         with torch.no_grad():
             canonical = self.scene.canonical(entities)
-        return lambda: float(labels(Step(self.scene, evidence, entities, canonical, frames)))
+        return lambda: float(labels(Step(self.scene, evidence, canonical, Selection(frames, entities))))
 
     def mismatch(self, stage: GraspStage) -> Mismatch:
         """How badly a hand's outline, in any poses of all frames, disagrees with its masks."""
         evidence = self.evidence(stage)
         frames = torch.arange(len(self.clip))
-        step = Step(self.scene, evidence, (), {}, frames)
+        step = Step(self.scene, evidence, {}, Selection(frames))
 
         @torch.no_grad()
         def ask(side: Side, poses: HandFrames) -> Tensor:

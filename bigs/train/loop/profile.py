@@ -10,7 +10,7 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest import mock
 
@@ -149,7 +149,9 @@ def profiled() -> Iterator[Profile]:
             stack.enter_context(mock.patch.object(owner, name, timed))
         stack.enter_context(mock.patch.object(Scene, "canonical", _timed_fields(profile, Scene.canonical)))
         for known in (terms.TERMS, *terms.IMAGE_TERMS.values()):
-            timed_terms = {name: _timed(profile, _LOSSES, term) for name, term in known.items()}
+            timed_terms = {
+                name: replace(term, loss=_timed(profile, _LOSSES, term.loss)) for name, term in known.items()
+            }
             stack.enter_context(mock.patch.dict(known, timed_terms))
         profile._began = time.perf_counter(), time.process_time()
         profile.begin("start values")

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bigs.checks import InputError, expected_among
+from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
 from bigs.train.loop.density import DensifyConfig, Pull, densified
 from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_cosine_rates
-from bigs.train.loop.step import Evidence, Step
-from bigs.train.loop.terms import IMAGE_TERMS, TERMS
+from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.terms import Term, terms_of
 from bigs.train.plan.config import OptimizeStage
 from bigs.types import Entity
 
@@ -116,11 +116,7 @@ def run_stage(
         InputError: the stage names an unknown group or term.
         FloatingPointError: losses or gradients are not finite however small the steps; names the first.
     """
-    image_terms = IMAGE_TERMS[stage.step]
-    unknown = [name for name in stage.weights if name not in TERMS and name not in image_terms]
-    if unknown:
-        accepted = expected_among(unknown[0], [*image_terms, *TERMS], "terms")
-        raise InputError(f"stage {stage.name}: {accepted}")
+    terms = terms_of(stage, f"stage {stage.name}")
     if "perceptual" in stage.weights and evidence.perceptual is None:
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)
@@ -138,9 +134,7 @@ def run_stage(
         for entity in entities
         if not set(FIELD_GROUPS["object" if entity == "object" else "hand"]) & set(stage.lrs)
     }
-    needs_canonical = any(
-        name in image_terms or name in ("color", "scale", "lbs", "offset") for name in stage.weights
-    )
+    needs_canonical = any(term.canonical for term in terms.values())
     with torch.no_grad():
         # A frozen field is evaluated once for the whole stage.
         fixed = scene.canonical(frozen) if needs_canonical else {}
@@ -150,19 +144,17 @@ def run_stage(
         began = time.perf_counter()
         moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
         frames = choose_frames(scene.n_frames, stage, seed, state.step)
-        step = Step(
-            scene,
-            evidence,
-            entities if needs_canonical else (),
-            {**fixed, **scene.canonical(moving)},
+        selection = Selection(
             frames,
-            "labels" in stage.weights,
-            seed * 1_000_003 + state.step,
-            stage.free_frames,
-            densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
+            entities if needs_canonical else (),
+            labels="labels" in terms,
+            seed=seed * 1_000_003 + state.step,
+            free_frames=stage.free_frames,
+            pull=densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
         )
-        terms, problem = _evaluate(step, stage)
-        loss = weighted_sum(terms, stage.weights) if problem is None else None
+        step = Step(scene, evidence, {**fixed, **scene.canonical(moving)}, selection)
+        values, problem = _evaluate(step, terms)
+        loss = weighted_sum(values, stage.weights) if problem is None else None
         if loss is not None:
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -188,7 +180,7 @@ def run_stage(
             StageProgress(
                 state.step,
                 stage.steps,
-                {name: float(value.detach()) for name, value in terms.items()},
+                {name: float(value.detach()) for name, value in values.items()},
                 float(loss.detach()),
                 time.perf_counter() - began,
             ),
@@ -207,7 +199,7 @@ def _field_of_object(scene: Scene, stage: OptimizeStage) -> ObjectSplats:
 
 def _densify(scene: Scene, step: Step, config: DensifyConfig, steps: int, state: StageState) -> StageState:
     """Add a step to what is known of the object's Gaussians; clone, split and prune them when it is time."""
-    gathered = step.object_pull() if step.watched else None
+    gathered = step.object_pull() if step.selection.pull else None
     pull = state.pull if gathered is None else state.pull.plus(*gathered)
     if config.is_due(steps, state.step):
         splats = scene.object_splats
@@ -227,17 +219,17 @@ def _spare_grasps(scene: Scene) -> None:
                 residual.grad[held] = 0.0
 
 
-def _evaluate(step: Step, stage: OptimizeStage) -> tuple[dict[str, Tensor], str | None]:
-    """The stage's terms, and which of them is not finite."""
-    terms = {}
-    for name in stage.weights:
+def _evaluate(step: Step, terms: Mapping[str, Term]) -> tuple[dict[str, Tensor], str | None]:
+    """The values of terms, and which of them is not finite."""
+    values = {}
+    for name, term in terms.items():
         try:
-            terms[name] = (IMAGE_TERMS[stage.step].get(name) or TERMS[name])(step)
+            values[name] = term.loss(step)
         except InputError as error:
             # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
-            return terms, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
-    bad = [name for name, value in terms.items() if not torch.isfinite(value)]
-    return terms, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
+            return values, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
+    bad = [name for name, value in values.items() if not torch.isfinite(value)]
+    return values, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
 
 
 def _first_unbounded(scene: Scene) -> str:

@@ -48,24 +48,39 @@ class Pixels(NamedTuple):
     shares: Tensor  # [M, E] for the entities rendered
 
 
+@dataclass(frozen=True)
+class Selection:
+    """What one step looks at: which subjects, in which frames, and how."""
+
+    frames: Tensor  # [B]
+    entities: tuple[Entity, ...] = ()  # rendered alone or together; none if no term looks at Gaussians
+    labels: bool = True  # whether the joint rendering has label channels
+    seed: int = 0  # of what the terms draw
+    free_frames: bool = False  # whether a hand alone is looked at where it holds nothing, instead of `frames`
+    pull: bool = False  # whether `Step.object_pull` will be asked for
+
+
 @dataclass
 class Step:
     """One optimisation step over some frames: holds the canonical Gaussians and what was made from them."""
 
     scene: Scene
     evidence: Evidence
-    entities: tuple[Entity, ...]  # rendered alone or together in this stage
-    canonical: dict[Entity, CanonicalHand | CanonicalObject]
-    frames: Tensor  # [B]
-    with_labels: bool = True  # whether the joint rendering has label channels
-    seed: int = 0  # of what the terms draw
-    free_frames: bool = False  # whether a hand alone is looked at where it holds nothing, instead of `frames`
-    watched: bool = False  # whether `object_pull` will be asked for
+    canonical: dict[Entity, CanonicalHand | CanonicalObject]  # of the selection's entities
+    selection: Selection
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.watched:
+        if self.selection.pull:
             self.canonical["object"].means.retain_grad()
+
+    @property
+    def entities(self) -> tuple[Entity, ...]:
+        return self.selection.entities
+
+    @property
+    def frames(self) -> Tensor:
+        return self.selection.frames
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -78,7 +93,7 @@ class Step:
 
     def frames_of(self, entity: Entity) -> Tensor:
         """The frames in which a subject is looked at alone."""
-        if self.free_frames and entity != "object":
+        if self.selection.free_frames and entity != "object":
             return self.scene.free_frames(entity)
         return self.frames
 
@@ -111,7 +126,7 @@ class Step:
 
     def generator(self) -> torch.Generator:
         """A fresh one for each term, so that what one term draws does not depend on the others."""
-        return torch.Generator().manual_seed(self.seed)
+        return torch.Generator().manual_seed(self.selection.seed)
 
     def render(self, gaussians: Gaussians, means2d: Means2d = "values") -> RenderOutput:
         """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
@@ -133,7 +148,7 @@ class Step:
         if entity not in self._alone:
             frames = self.frames_of(entity)
             posed = self.clip.at(frames).posed(entity, self.canonical[entity])
-            if self.watched and entity == "object":
+            if self.selection.pull and entity == "object":
                 self._alone[entity] = self.render(posed, "full")
                 self._alone[entity].info["means2d"].retain_grad()
             else:
@@ -141,7 +156,7 @@ class Step:
         return self._alone[entity]
 
     def object_pull(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """How the loss pulls at the object's N Gaussians, after the backward pass of a watched step.
+        """How the loss pulls at the object's N Gaussians, after the backward pass of a step that selects `pull`.
 
         Returns:
             The gradient [B, N, 2] at their centres on screen, of an error averaged over all pixels of one of
@@ -166,7 +181,7 @@ class Step:
         parts = []
         for entity, label in zip(self.entities, labels, strict=True):
             part = self.clip.at(self.frames).posed(entity, self.canonical[entity])
-            if self.with_labels:
+            if self.selection.labels:
                 channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
                 part = part._replace(colors=channels)
             parts.append(part)

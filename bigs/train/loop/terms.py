@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from bigs.checks import check_choice
 from bigs.losses.contact import center_contact, penetration, surface_contact
 from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on, spilled
 from bigs.losses.perceptual import masked_perceptual
@@ -14,6 +16,7 @@ from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.train.loop.step import Step
+from bigs.train.plan.config import OptimizeStage
 from bigs.types import Side
 
 
@@ -30,24 +33,29 @@ def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) ->
 
 
 def image_alone(step: Step) -> Tensor:
+    """|I - I*| of the paper (Eq. 5) over the pixels that each subject shows, a mean over subjects."""
     return _each_alone(step, masked_l1)
 
 
 def mse_alone(step: Step) -> Tensor:
+    """(I - I*)² over the pixels that each subject shows, a mean over subjects."""
     return _each_alone(step, masked_mse)
 
 
 def ssim_alone(step: Step) -> Tensor:
+    """1 - SSIM of each subject inside its own mask (paper Eq. 5), a mean over subjects."""
     return _each_alone(step, masked_ssim)
 
 
 def mask_alone(step: Step) -> Tensor:
+    """The paper's mask regulariser (1 - m) I (Eq. 5) for each subject rendered alone; m is the union of all masks."""
     return _mean(
         outside_mask(step.alone(entity).colors, step.foreground_alone(entity)) for entity in step.entities
     )
 
 
 def mask_random_alone(step: Step) -> Tensor:
+    """`mask` over a random colour, as in the released code: black Gaussians cannot hide outside m."""
     generator = step.generator()
     return _mean(
         outside_mask_on(
@@ -61,6 +69,7 @@ def mask_random_alone(step: Step) -> Tensor:
 
 
 def perceptual_alone(step: Step) -> Tensor:
+    """VGG-16 or LPIPS distance of patches of each subject (paper Eq. 5), a mean over subjects."""
     generator = step.generator()
     return _mean(
         masked_perceptual(
@@ -85,33 +94,39 @@ def coverage_alone(step: Step) -> Tensor:
 
 
 def image_together(step: Step) -> Tensor:
+    """|I - I*| of the paper (Eq. 9) over the pixels that show any subject."""
     return masked_l1(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
 
 
 def mse_together(step: Step) -> Tensor:
+    """(I - I*)² over the pixels that show any subject."""
     return masked_mse(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
 
 
 def ssim_together(step: Step) -> Tensor:
+    """1 - SSIM inside the union of all masks (paper Eq. 9)."""
     return masked_ssim(step.together.colors[..., :3], step.images, step.foreground)
 
 
 def mask_together(step: Step) -> Tensor:
-    """The paper's, sleeves and all; `spill` leaves out what they cover."""
+    """The paper's mask regulariser (1 - m) I, also where sleeves are; `spill` leaves those out."""
     return outside_mask(step.together.colors[..., :3], step.foreground)
 
 
 def spill(step: Step) -> Tensor:
+    """Squared alpha outside all masks, per pixel of the masks, without what something unlabelled covers."""
     pixels = step.pixels
     return spilled(pixels.alphas, pixels.empty, pixels.foreground)
 
 
 def mask_random_together(step: Step) -> Tensor:
+    """`mask` over a random colour, as in the released code."""
     rendered = step.together
     return outside_mask_on(rendered.colors[..., :3], rendered.alphas, step.foreground, step.generator())
 
 
 def perceptual_together(step: Step) -> Tensor:
+    """VGG-16 or LPIPS distance of patches inside the union of all masks (paper Eq. 9)."""
     return masked_perceptual(
         step.together.colors[..., :3],
         step.images,
@@ -122,6 +137,7 @@ def perceptual_together(step: Step) -> Tensor:
 
 
 def labels(step: Step) -> Tensor:
+    """Squared difference of label channels and masks: which subject each pixel shows, occlusion included."""
     return label_difference(step.pixels.colors[:, 3:], step.pixels.shares)
 
 
@@ -137,14 +153,17 @@ def silhouette(step: Step) -> Tensor:
 
 
 def color(step: Step) -> Tensor:
+    """The paper's L_color: spread of each subject's canonical colours."""
     return _mean(color_spread(step.canonical[entity].colors) for entity in step.entities)
 
 
 def scale(step: Step) -> Tensor:
+    """The paper's L_scale: size of each subject's canonical Gaussians."""
     return _mean(scale_size(step.canonical[entity].scales) for entity in step.entities)
 
 
 def lbs(step: Step) -> Tensor:
+    """The paper's L_lbs: squared departure of skinning weights from the hand model's, a mean over hands."""
     return _mean(
         lbs_deviation(
             step.canonical[side].weights,
@@ -164,7 +183,7 @@ def offset(step: Step) -> Tensor:
 
 
 def smooth(step: Step) -> Tensor:
-    """The paper's L_smt over the whole clip."""
+    """The paper's L_smt: squared steps of poses and wrists from frame to frame, over the whole clip."""
 
     def one(side: Side) -> Tensor:
         pose = step.clip.canonical_hand(side)
@@ -174,10 +193,12 @@ def smooth(step: Step) -> Tensor:
 
 
 def joint_acceleration(step: Step) -> Tensor:
+    """Second differences of all joints over time, a mean over hands."""
     return _mean(acceleration(joints) for joints in step.joints.values())
 
 
 def object_acceleration(step: Step) -> Tensor:
+    """Second differences over time of three points at the object's reach along its axes."""
     if not step.has_object:
         return torch.zeros(())
     reach = step.scene.object_surface.verts.abs().amax()
@@ -186,6 +207,7 @@ def object_acceleration(step: Step) -> Tensor:
 
 
 def orient_prior(step: Step) -> Tensor:
+    """Squared residuals of global orientation, radians."""
     return _mean(squared_norm(poses.orient) for poses in step.scene.hand_poses.values())
 
 
@@ -256,51 +278,82 @@ def contact(step: Step) -> Tensor:
 
 
 def penetrating(step: Step) -> Tensor:
+    """Squared depth of hand vertices inside the object, in centimetres beyond a millimetre."""
     if not step.has_object:
         return torch.zeros(())
     return _mean(penetration(distances) for distances in step.object_distances.values())
 
 
+@dataclass(frozen=True)
+class Term:
+    """A loss term and what it needs of a step."""
+
+    loss: Callable[[Step], Tensor]  # a scalar
+    canonical: bool  # whether it looks at the subjects' Gaussians, which cost an evaluation of their fields
+
+    def __call__(self, step: Step) -> Tensor:
+        return self.loss(step)
+
+
+def _of_gaussians(**losses: Callable[[Step], Tensor]) -> dict[str, Term]:
+    return {name: Term(loss, canonical=True) for name, loss in losses.items()}
+
+
+def _of_poses(**losses: Callable[[Step], Tensor]) -> dict[str, Term]:
+    return {name: Term(loss, canonical=False) for name, loss in losses.items()}
+
+
 # Terms of rendered images, which differ between the paper's two steps.
-IMAGE_TERMS: dict[str, dict[str, Callable[[Step], Tensor]]] = {
-    "single-subject": {
-        "image": image_alone,
-        "mse": mse_alone,
-        "ssim": ssim_alone,
-        "perceptual": perceptual_alone,
-        "mask": mask_alone,
-        "mask_random": mask_random_alone,
-        "coverage": coverage_alone,
-    },
-    "interacting-subjects": {
-        "image": image_together,
-        "mse": mse_together,
-        "ssim": ssim_together,
-        "perceptual": perceptual_together,
-        "mask": mask_together,
-        "spill": spill,
-        "mask_random": mask_random_together,
-        "labels": labels,
-    },
+IMAGE_TERMS: dict[str, dict[str, Term]] = {
+    "single-subject": _of_gaussians(
+        image=image_alone,
+        mse=mse_alone,
+        ssim=ssim_alone,
+        perceptual=perceptual_alone,
+        mask=mask_alone,
+        mask_random=mask_random_alone,
+        coverage=coverage_alone,
+    ),
+    "interacting-subjects": _of_gaussians(
+        image=image_together,
+        mse=mse_together,
+        ssim=ssim_together,
+        perceptual=perceptual_together,
+        mask=mask_together,
+        spill=spill,
+        mask_random=mask_random_together,
+        labels=labels,
+    ),
 }
 
 # Terms of the canonical subjects and of the poses.
-TERMS: dict[str, Callable[[Step], Tensor]] = {
-    "silhouette": silhouette,
-    "color": color,
-    "scale": scale,
-    "lbs": lbs,
-    "offset": offset,
-    "smooth": smooth,
-    "acceleration": joint_acceleration,
-    "object_acceleration": object_acceleration,
-    "orient_prior": orient_prior,
-    "pose_prior": pose_prior,
-    "depth_prior": depth_prior,
-    "betas_prior": betas_prior,
-    "object_prior": object_prior,
-    "shade_prior": shade_prior,
-    "rigid": rigid,
-    "contact": contact,
-    "penetration": penetrating,
+TERMS: dict[str, Term] = {
+    **_of_gaussians(color=color, scale=scale, lbs=lbs, offset=offset),
+    **_of_poses(
+        silhouette=silhouette,  # by Gaussians of its own
+        smooth=smooth,
+        acceleration=joint_acceleration,
+        object_acceleration=object_acceleration,
+        orient_prior=orient_prior,
+        pose_prior=pose_prior,
+        depth_prior=depth_prior,
+        betas_prior=betas_prior,
+        object_prior=object_prior,
+        shade_prior=shade_prior,
+        rigid=rigid,
+        contact=contact,
+        penetration=penetrating,
+    ),
 }
+
+
+def terms_of(stage: OptimizeStage, where: str) -> dict[str, Term]:
+    """The terms that a stage, which messages call `where`, names.
+
+    Raises:
+        InputError: it names an unknown one, or one of the other kind of step.
+    """
+    known = IMAGE_TERMS[stage.step] | TERMS
+    for name in stage.weights:
+        check_choice(where, name, known, "terms")
+    return {name: known[name] for name in stage.weights}

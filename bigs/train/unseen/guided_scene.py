@@ -15,7 +15,7 @@ from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene
 from bigs.raster.settings import RasterSettings
-from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.plan.config import GuidanceStage
 from bigs.train.unseen.completed_scene import CompletedScene
 from bigs.train.unseen.guided import (
@@ -186,7 +186,7 @@ def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject,
     frames = torch.linspace(0, scene.n_frames - 1, min(_HOLDING_FRAMES, scene.n_frames)).round().long()
 
     def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
-        step = Step(scene, evidence, ("object",), {"object": now}, frames, with_labels=False)
+        step = Step(scene, evidence, {"object": now}, Selection(frames, ("object",), labels=False))
         shown = step.alone("object")
         free = 1.0 - step.hidden_alone("object")
         return free[..., None] * torch.cat([shown.colors, shown.alphas], dim=-1)

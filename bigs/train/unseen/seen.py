@@ -12,7 +12,7 @@ from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.losses.photometric import masked_l1
 from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene, concatenate
-from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.types import Entity
 
 # Poses are wrong by about so much, metres.
@@ -55,7 +55,7 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
     ink = torch.ones(len(canonical["object"].means), 1).requires_grad_()
     most = torch.zeros(len(ink))
     for frame in torch.arange(scene.n_frames)[:, None]:
-        step = Step(scene, evidence, scene.entities, canonical, frame, with_labels=False)
+        step = Step(scene, evidence, canonical, Selection(frame, scene.entities, labels=False))
         parts = []
         for entity in scene.entities:
             with torch.no_grad():
@@ -73,7 +73,7 @@ def overflow(scene: Scene, evidence: Evidence, frames: Tensor) -> Tensor:
 
     Where hands or something unlabelled may hide it, the mask allows everything.
     """
-    step = Step(scene, evidence, ("object",), scene.canonical(("object",)), frames, with_labels=False)
+    step = Step(scene, evidence, scene.canonical(("object",)), Selection(frames, ("object",), labels=False))
     hidden = step.hidden_alone("object")
     beyond = (1.0 - hidden - step.share("object")).clamp_min(0.0)
     outside = (beyond * step.alone("object").alphas[..., 0]).sum((1, 2))
@@ -83,6 +83,6 @@ def overflow(scene: Scene, evidence: Evidence, frames: Tensor) -> Tensor:
 @torch.no_grad()
 def image_error(scene: Scene, evidence: Evidence, entities: Sequence[Entity], frames: Tensor) -> float:
     """Mean absolute error of the colours where some entities, rendered together, show in the clip."""
-    step = Step(scene, evidence, tuple(entities), scene.canonical(entities), frames, with_labels=False)
+    step = Step(scene, evidence, scene.canonical(entities), Selection(frames, tuple(entities), labels=False))
     shares = torch.stack([step.share(entity) for entity in entities]).sum(0).clamp(max=1.0)
     return float(masked_l1(step.together.colors, step.images, shares))

@@ -16,7 +16,7 @@ from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
 from bigs.train.grasps.find import carried_errors, expected_depths, find_grasps, turned_between
-from bigs.train.loop.step import Step
+from bigs.train.loop.step import Selection, Step
 from bigs.train.loop.terms import depth_prior
 from bigs.train.plan.config import GraspStage, RunConfig
 from bigs.types import Side
@@ -183,13 +183,13 @@ def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
 
 def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
     scene = cube_scene({"right": procedural_hand()})
-    step = Step(scene, None, (), {}, torch.arange(3))
+    step = Step(scene, None, {}, Selection(torch.arange(3)))
     poses = scene.hand_poses["right"]
     assert depth_prior(step) == 0, "nothing is expected of anything yet"
     with torch.no_grad():
         poses.expected_log_depth[1] = poses.position.base_log_depth[1] + 0.1
         poses.has_expected_depth[1] = True
-    loss = depth_prior(Step(scene, None, (), {}, torch.arange(3)))
+    loss = depth_prior(Step(scene, None, {}, Selection(torch.arange(3))))
     torch.testing.assert_close(loss, torch.tensor(0.01 / 3 / len(scene.sides)))
     loss.backward()
     gradient = poses.position.log_depth.grad

@@ -27,7 +27,7 @@ from bigs.train.loop.checkpoint import FILE_NAME
 from bigs.train.loop.density import DensifyConfig
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageProgress, StageState, choose_frames, run_stage
-from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.terms import TERMS
 from bigs.train.plan.config import OptimizeStage, RunConfig, SplitStage
 from bigs.train.plan.config_file import from_plain, to_plain, with_changes
@@ -67,10 +67,8 @@ def test_pull_is_counted_per_pixel_and_half_of_the_clips_image(
     step = Step(
         scene,
         replace(evidence, targets=targets),
-        ("right", "object"),
         scene.canonical(("right", "object")),
-        torch.tensor([0, 2]),
-        watched=True,
+        Selection(torch.tensor([0, 2]), ("right", "object"), pull=True),
     )
     assert step.object_pull() is None
     pixels = step.alone("object").info["means2d"]
@@ -234,7 +232,7 @@ def test_after_what_is_not_finite_it_goes_back_to_as_many_as_there_were(
         calls[0] += 1
         return true(step) * (float("nan") if calls[0] == 8 else 1.0)
 
-    monkeypatch.setitem(TERMS, "offset", faulty)
+    monkeypatch.setitem(TERMS, "offset", replace(true, loss=faulty))
     counts: list[tuple[int, int]] = []
     told: list[str] = []
     state = run_stage(

@@ -14,7 +14,7 @@ from bigs.losses.mask import amodal_silhouette
 from bigs.models.hand_splats import pose_hand
 from bigs.models.scene import Scene
 from bigs.train.loop.evidence import EvidenceSource
-from bigs.train.loop.step import Step
+from bigs.train.loop.step import Selection, Step
 from bigs.train.plan.presets import FAST, SMOKE
 from bigs.train.start.build import build_scene
 from bigs.types import Side
@@ -67,7 +67,7 @@ def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
     targets, side, frames = evidence.targets, "right", torch.tensor([0, 6])
     verts = scene.at(frames).verts(side).detach().numpy()
     faces = scene.hand_model(side).faces.numpy()
-    step = Step(scene, evidence, (side,), {}, frames)
+    step = Step(scene, evidence, {}, Selection(frames, (side,)))
     shares = [
         hand_pixels(v.astype(np.float64), faces, targets.K, targets.width, targets.height) for v in verts
     ]

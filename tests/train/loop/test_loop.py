@@ -20,7 +20,7 @@ from bigs.models.scene import Scene
 from bigs.train.grasps.find import find_grasps
 from bigs.train.loop.optim import GROUPS, group_parameters
 from bigs.train.loop.run_stage import StageProgress, StageState, choose_frames, run_stage, stage_entities
-from bigs.train.loop.step import Evidence, Step
+from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.targets import Targets
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
 from bigs.train.plan.config import GraspStage, OptimizeStage
@@ -135,7 +135,7 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     shares = {entity: share * (torch.arange(40) < 25) for entity, share in targets.shares.items()}
     evidence = replace(evidence, targets=replace(targets, shares=shares))
     frames = torch.tensor([0, 2])
-    step = Step(scene, evidence, scene.entities, scene.canonical(scene.entities), frames)
+    step = Step(scene, evidence, scene.canonical(scene.entities), Selection(frames, scene.entities))
     assert 0 < len(step.pixels.colors) < 2 * 30 * 40
     rendered, foreground = step.together.colors, evidence.targets.foreground[frames]
     labels = torch.stack([shares[entity][frames] for entity in scene.entities], dim=-1)
@@ -160,8 +160,11 @@ def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, nam
     bare = replace(targets, shares=nothing, unknown=torch.zeros_like(targets.unknown))
 
     def term(targets: Targets) -> Tensor:
-        frames, canonical = torch.tensor([0, 2]), scene.canonical(scene.entities)
-        step = Step(scene, replace(evidence, targets=targets), scene.entities, canonical, frames)
+        canonical, selection = (
+            scene.canonical(scene.entities),
+            Selection(torch.tensor([0, 2]), scene.entities),
+        )
+        step = Step(scene, replace(evidence, targets=targets), canonical, selection)
         return IMAGE_TERMS["interacting-subjects"][name](step)
 
     assert term(covered) == 0.0
@@ -173,9 +176,8 @@ def test_the_papers_mask_term_counts_what_a_sleeve_covers(scene: Scene, evidence
     """Its form is (1 - m) over the whole image."""
     targets, frames = evidence.targets, torch.tensor([0, 2])
     covered = replace(targets, unknown=1.0 - targets.foreground)
-    step = Step(
-        scene, replace(evidence, targets=covered), scene.entities, scene.canonical(scene.entities), frames
-    )
+    evidence, selection = replace(evidence, targets=covered), Selection(frames, scene.entities)
+    step = Step(scene, evidence, scene.canonical(scene.entities), selection)
     expected = outside_mask(step.together.colors[..., :3], targets.foreground[frames])
     assert IMAGE_TERMS["interacting-subjects"]["mask"](step) == expected > 0.0
 
