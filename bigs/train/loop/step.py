@@ -156,7 +156,7 @@ class Step:
         return self._alone[entity]
 
     def object_pull(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """How the loss pulls at the object's N Gaussians, after the backward pass of a step that selects `pull`.
+        """How the loss pulls at the object's N Gaussians, after the backward pass of a step with `pull`.
 
         Returns:
             The gradient [B, N, 2] at their centres on screen, of an error averaged over all pixels of one of

@@ -48,7 +48,7 @@ def ssim_alone(step: Step) -> Tensor:
 
 
 def mask_alone(step: Step) -> Tensor:
-    """The paper's mask regulariser (1 - m) I (Eq. 5) for each subject rendered alone; m is the union of all masks."""
+    """The paper's mask regulariser (1 - m) I (Eq. 5) of each subject alone; m is the union of all masks."""
     return _mean(
         outside_mask(step.alone(entity).colors, step.foreground_alone(entity)) for entity in step.entities
     )

@@ -160,10 +160,8 @@ def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, nam
     bare = replace(targets, shares=nothing, unknown=torch.zeros_like(targets.unknown))
 
     def term(targets: Targets) -> Tensor:
-        canonical, selection = (
-            scene.canonical(scene.entities),
-            Selection(torch.tensor([0, 2]), scene.entities),
-        )
+        selection = Selection(torch.tensor([0, 2]), scene.entities)
+        canonical = scene.canonical(scene.entities)
         step = Step(scene, replace(evidence, targets=targets), canonical, selection)
         return IMAGE_TERMS["interacting-subjects"][name](step)
 
