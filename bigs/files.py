@@ -155,9 +155,7 @@ def _check_yaml(where: str, text: str) -> None:
     for event in yaml.parse(text, Loader=_YamlLoader):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
-                raise InputError(
-                    f"{where}: expected aliases of what stands before them, found *{event.anchor}"
-                )
+                raise InputError(f"{where}: expected aliases after their anchors, found *{event.anchor}")
             count += sizes[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):
             count += 1

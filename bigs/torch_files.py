@@ -62,7 +62,7 @@ def load_torch(where: str, stream: BinaryIO, what: str) -> Any:
     except Exception as error:  # pickle promises no particular exception for malformed data
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
-            f"{where}: expected {what}, found what cannot be read safely ({shown(reason[-1])})"
+            f"{where}: expected {what}, found data that cannot be read safely ({shown(reason[-1])})"
         ) from None
 
 

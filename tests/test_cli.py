@@ -59,9 +59,9 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "demo": "Make a little clip of two hands",
         "preprocess": "from a video or images",
         "preprocess all": "21 keypoints of each hand",
-        "preprocess frames": "Take one frame of so many",
+        "preprocess frames": "Keep every Nth frame",
         "preprocess masks": "label images of right hand",
-        "preprocess hands": "What another hand estimator",
+        "preprocess hands": "Output of a hand estimator",
         "preprocess object": "structure from motion",
         "preprocess align": "one metric space",
         "preprocess build": "that HOLD and bigs reconstruct",
@@ -73,10 +73,10 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "doctor": "what that would enable",
         "view": "can be reached from this machine only",
         "info": "HANDS-challenge build folder",
-        "prior": "sides that a clip never shows",
+        "prior": "sides of an object that a clip never shows",
         "prior fit": "textual inversion",
         "prior train": "folder of meshes",
-        "bench": "Measure how fast",
+        "bench": "Measure speed",
         "ablate": "beside the paper's Table 3",
         "bench adjustment": "consecutive frames a point is seen",
         "bench engine": "runs of everything",
@@ -145,7 +145,7 @@ def test_ingredients_are_left_out(
     assert answer.code == 0, answer.err
     fast = replace(PRESETS["fast"], seed=3)
     assert given == [replace(fast, hand=replace(fast.hand, shared=False))]
-    assert f"--without {idle}: this plan has nothing of it" in answer.out
+    assert f"--without {idle}: this plan does not contain it" in answer.out
     assert "--without share" not in answer.out
 
 

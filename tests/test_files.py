@@ -120,7 +120,7 @@ HOSTILE_YAML = {
     "merges": (merges(40), f"at most {MAX_YAML_NODES} values with its aliases"),
     "deep": ("[" * 100_000, "levels"),
     "deep mapping": ("".join(" " * i + "a:\n" for i in range(200)), "levels"),
-    "itself": ("a: &a [*a]", "expected aliases of what stands before them"),
+    "itself": ("a: &a [*a]", "expected aliases after their anchors"),
     "digits": (f"a: {'9' * 5000}", "expected YAML, found|digits"),
     "400 digits": (f"a: {'9' * 400}", "numbers of at most 100 digits, found an integer of"),
     "hexadecimal": (f"a: 0x{'f' * 100_000}", "numbers of at most 100 digits"),

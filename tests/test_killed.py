@@ -119,7 +119,7 @@ def test_two_do_not_work_on_one_run(
     with only_writer(out):
         nursery.start(*command, "--out", out, "--resume", output=said)
         assert nursery.ended() == 2
-    assert "run: expected a run that rests, found another process at it" in said.read_text()
+    assert "run: expected a run that no other process works on, found one at work" in said.read_text()
     assert list(out.iterdir()) == []
 
 

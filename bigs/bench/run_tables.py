@@ -236,7 +236,7 @@ def _switches(report: dict[str, Any]) -> Table:
             )
             for _, k, _ in SCORES
         ]
-        absent = ", ".join(f"this plan has nothing of {name}" for name in group[0]["nothing_of"])
+        absent = ", ".join(f"this plan does not contain {name}" for name in group[0]["nothing_of"])
         cells = (_change(c, digits) for c, (_, _, digits) in zip(changes, SCORES, strict=True))
         columns.append((label, _change(seconds, 1), *cells, absent))
     note = "Change against the same preset with everything, mean over clips: what a switch costs and gains."

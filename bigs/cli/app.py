@@ -55,12 +55,11 @@ COMMANDS: Commands = {
         "robustness": bench.bench_robustness,
     },
 }
-# What the help says of commands that have commands of their own.
+# Help texts of commands that have subcommands.
 GROUPS = {
-    "preprocess": "Make a clip from a video or images, whole (bigs preprocess VIDEO --out CLIP) or "
-    "step by step.",
-    "prior": "Prepare what is known of objects in general for sides that a clip never shows.",
-    "bench": "Measure how fast and how exact this is.",
+    "preprocess": "Make a clip from a video or images: all steps (bigs preprocess VIDEO --out CLIP) or one.",
+    "prior": "Train a prior for the sides of an object that a clip never shows.",
+    "bench": "Measure speed and accuracy.",
 }
 
 # What torch, FFmpeg and the system say where Python would raise MemoryError.
@@ -109,15 +108,15 @@ def _told(error: Exception) -> tuple[str, int]:
         return f"{place}expected a file or folder that can be read or written, found: {reason}", 4
     if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
         return (
-            "expected enough memory for this command, found that the system grants no more; smaller or fewer "
-            "pictures, or other programs closed, may help",
+            "expected enough memory for this command, found none left; try smaller or fewer pictures, "
+            "or close other programs",
             6,
         )
     reason = " ".join(str(error).split())
     told = f"{type(error).__name__}{f' ({reason[:_REASON]})' if reason else ''}"
     return (
-        f"an error that bigs did not foresee: {told}; please report it with the command and the traceback, "
-        "which the same command shows with --debug",
+        f"an unexpected error: {told}; please report it with the command and its traceback "
+        "(--debug shows it)",
         1,
     )
 
@@ -144,7 +143,7 @@ def _parse(arguments: list[str]) -> Callable[[], None]:
                 _choice_of(COMMANDS),
                 prog="bigs",
                 description="Two hands and the object they hold, as 3D Gaussians, from one video, on a CPU. "
-                "Without a command there is --version; --debug, with any, shows the traceback of an error.",
+                "--version prints the version; --debug shows the traceback of an error.",
                 args=arguments,
             )
     except SystemExit as stop:

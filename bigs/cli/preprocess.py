@@ -27,13 +27,13 @@ class FrameOptions:
     colmap: Path | None = None
     """Folder of a COLMAP model whose first camera is the source's."""
     stride: int = 1
-    """Take one frame of so many."""
+    """Keep every Nth frame."""
     sharpest: bool = False
-    """Of each stride take the sharpest picture, not the first."""
+    """Keep the sharpest picture of each stride, not the first."""
     start: int = 0
-    """Number of the first picture that counts."""
+    """Number of the first picture to use."""
     count: int = 0
-    """At most so many frames; 0 takes all."""
+    """Stop after this many frames; 0 keeps all."""
     max_size: int = 1280
     """Shrink larger pictures to this many pixels on the longer side; 0 keeps their size."""
 
@@ -45,9 +45,9 @@ class MaskOptions:
     masks: Path | None = None
     """Folder of masks: label images, or one folder each for right, left and object."""
     mask_labels: tuple[str, ...] = ()
-    """What the values in the masks mean, as right=1 left=2 object=3; 150, 250 and 50 if not given."""
+    """Meaning of the mask values, such as right=1 left=2 object=3; by default 150, 250 and 50."""
     sam2: Path | None = None
-    """Folder of a SAM 2 video model's weights, to make the masks with."""
+    """Folder with the weights of a SAM 2 video model, which then makes the masks."""
     clicks: Path | None = None
     """JSON file of clicks or boxes for --sam2."""
 
@@ -57,11 +57,11 @@ class HandOptions:
     """Where the hands come from."""
 
     keypoints: Path | None = None
-    """JSON file of 21 keypoints of each hand in each frame, to which hands are fitted."""
+    """JSON file with 21 keypoints of each hand in each frame; hands are fitted to them."""
     hands: Path | None = None
-    """What another hand estimator wrote (HaMeR, HOLD, WiLoR), instead of keypoints."""
+    """Output of a hand estimator (HaMeR, HOLD, WiLoR) instead of keypoints."""
     landmarker: Path | None = None
-    """Model file of MediaPipe's HandLandmarker, to find the keypoints with."""
+    """Model file of MediaPipe's HandLandmarker, which then finds the keypoints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +69,11 @@ class ObjectOptions:
     """How the object's motion is found."""
 
     disk: Path | None = None
-    """File of DISK's weights, to find features with instead of SIFT."""
+    """File with DISK's weights, to use its features instead of SIFT."""
     lightglue: Path | None = None
-    """File of LightGlue's weights for DISK, to match them with."""
+    """File with LightGlue's weights for DISK, to match its features."""
     exhaustive: bool = False
-    """Match every pair of frames, not only the next ten: slower, and look-alike sides may be mistaken."""
+    """Match every pair of frames, not only the next ten: slower, and may confuse sides that look alike."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -171,7 +171,7 @@ def reconstruct(
             clip, out, settings, hand_model=hand_model, ground_truth=gt, resume=resume, listen=listen
         )
     for name in unused:
-        say(f"--without {name}: this plan has nothing of it")
+        say(f"--without {name}: this plan does not contain it")
     show(outcome)
 
 

@@ -71,7 +71,9 @@ def _plausible_hand(
             f"{where}: expected shape parameters between -{MOST_BETA:g} and {MOST_BETA:g}, found {beta:.3g}"
         )
     if beta > ODD_BETA:
-        notes.append(f"{side} hand: a shape parameter is {beta:.3g} standard deviations; nobody's hand is so")
+        notes.append(
+            f"{side} hand: a shape parameter is {beta:.3g} standard deviations; no real hand is like that"
+        )
     faults = _misplaced(clip, side, rest_wrist + track.transl, track.valid, notes)
     if not faults.any():
         return track
@@ -105,7 +107,7 @@ def _plausible_object(clip: Clip, track: ObjectTrack, notes: list[str]) -> Objec
         colors = None if track.colors is None else track.colors[kept]
         track = replace(track, points=track.points[kept], colors=colors)
     if not clip.annotated and kept.sum() < FEW_POINTS:
-        notes.append(f"object: only {int(kept.sum())} points; its shape is little more than a guess")
+        notes.append(f"object: only {int(kept.sum())} points; its shape will be little more than a guess")
     faults = _misplaced(clip, "object", track.rotations @ middle + track.transl, track.valid, notes)
     if faults.any():
         valid = track.valid & ~faults
@@ -140,7 +142,7 @@ def _misplaced(
     for wrong, found in ((behind, "behind the camera"), (away, f"more than {FARTHEST_M:g} m away")):
         if (behind | away)[valid].all() and wrong.any():
             raise InputError(
-                f"{clip.folder}: {name}: expected it {NEAREST_M:g} to {FARTHEST_M:g} m before the camera, "
+                f"{clip.folder}: {name}: expected {NEAREST_M:g} to {FARTHEST_M:g} m in front of the camera, "
                 f"found it {found} in {_frames(wrong)}"
             )
         if wrong.any():
@@ -152,8 +154,8 @@ def _check_filled(clip: Clip, entity: Entity, places: np.ndarray) -> None:
     behind = _in_camera(clip, places)[:, 2] < NEAREST_M
     if behind.any():
         raise InputError(
-            f"{clip.folder}: {entity}: expected estimates before the camera on both sides of a gap, found "
-            f"that the camera turns away from them in {_frames(behind)}"
+            f"{clip.folder}: {entity}: expected interpolated poses in front of the camera, found "
+            f"poses behind it in {_frames(behind)}"
         )
 
 

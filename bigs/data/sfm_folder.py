@@ -273,7 +273,9 @@ def _object_track(
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = float(np.median((hand_depths / depths)[valid]))
         if not 0.0 < scale < np.inf:
-            raise InputError(f"{folder}: expected hands and object before the camera, found one behind it")
+            raise InputError(
+                f"{folder}: expected hands and object in front of the camera, found one behind it"
+            )
     return ObjectTrack(
         points=points,
         colors=model.colors,

@@ -145,8 +145,8 @@ def _class(name: str) -> Any:
     except (ImportError, RuntimeError) as error:
         # Both libraries look for torchvision, and one built for another torch takes them down.
         raise InputError(
-            f"diffusion prior: expected {name}, found that it cannot be imported, as with a torchvision "
-            f"that does not fit torch; none is needed (pip uninstall torchvision): {_reason(error)}"
+            f"diffusion prior: expected {name}, found an import error, perhaps from a torchvision that "
+            f"does not match torch (pip uninstall torchvision; bigs needs none): {_reason(error)}"
         ) from error
 
 
@@ -197,8 +197,8 @@ def _load(source: str, name: str, kind: str, subfolder: str) -> Any:
                 f"{source}: expected a readable component {name}, found: {_reason(error)}"
             ) from error
         raise InputError(
-            f"{source}: expected a model of the Hugging Face hub for the component {name}, found that it "
-            "can neither be fetched nor is in the cache; pass a local folder"
+            f"{source}: expected a model of the Hugging Face hub for the component {name}, found it "
+            "neither on the hub nor in the cache; pass a local folder"
         ) from error
     if name not in _NETWORKS:
         return loaded

@@ -77,9 +77,7 @@ def new_words(parts: Parts, words: list[str]) -> list[int]:
     known = parts.tokenizer.get_vocab()
     for word in words:
         if word in known:
-            raise InputError(
-                f"token {word}: expected a word that is new to the model, found that it knows it"
-            )
+            raise InputError(f"token {word}: expected a word that is new to the model, found one that it has")
     parts.tokenizer.add_tokens(words)
     rows = max(len(parts.tokenizer), parts.text_encoder.config.vocab_size)
     parts.text_encoder.resize_token_embeddings(rows, mean_resizing=False)
@@ -88,6 +86,6 @@ def new_words(parts: Parts, words: list[str]) -> list[int]:
     for word, row in zip(words, found, strict=True):
         if parts.tokenizer(word, add_special_tokens=False).input_ids != [row]:
             raise InputError(
-                f"token {word}: expected a word that the tokenizer keeps whole, found it is split"
+                f"token {word}: expected a word that the tokenizer keeps whole, found one that it splits"
             )
     return found

@@ -19,20 +19,20 @@ class Headline(NamedTuple):
 HEADLINES = (
     Headline(
         ("mpjpe_ra_h", "mpjpe_ra_r", "mpjpe_ra_l"),
-        "how far the 21 joints of a hand are from the true ones, wrists laid on each other; lower is better",
+        "mean distance of the 21 hand joints from the true ones, after aligning the wrists; lower is better",
     ),
     Headline(
         ("cd_h_sq", "cd_r_sq", "cd_l_sq"),
-        "how far the object is from the true one, both seen from the wrist; lower is better",
+        "distance of the object from the true one, relative to the wrist; lower is better",
     ),
     Headline(
         ("cd_icp_sq",),
-        "how far the object's shape alone is from the true one, laid on it and scaled; lower is better",
+        "distance of the object's shape from the true one, after alignment and scaling; lower is better",
     ),
-    Headline(("f10_icp",), "how much of that shape is within 10 mm of the true one; higher is better"),
+    Headline(("f10_icp",), "F-score of the aligned shape at 10 mm; higher is better"),
     Headline(
         ("psnr_foreground",),
-        "how like the video the rendering is where hands and object are; higher is better",
+        "likeness of rendering and video where hands and object are; higher is better",
     ),
 )
 

@@ -98,7 +98,7 @@ def align(
         InputError: there is no hand to take the size from.
     """
     if not hands:
-        raise InputError("alignment: expected at least one hand, whose size tells the object's, found none")
+        raise InputError("alignment: expected at least one hand to measure the object by, found none")
     verts = {side: posed_vertices(track, hand_models[side]) for side, track in hands.items()}
     touching = {
         side: np.array([masks_touch(labels, side, config.touch_pixels) for labels in masks])
@@ -116,7 +116,9 @@ def align(
     if frames == 0:
         transl = {side: track.transl for side, track in hands.items()}
         none = {side: np.zeros(len(masks)) for side in hands}
-        note = "hand and object never touch in the masks: the object's size is a guess from the hands' depth"
+        note = (
+            "hand and object never touch in the masks, so the object's size is guessed from the hands' depth"
+        )
         report = AlignReport(touching, factors, np.zeros(len(factors)), none, (note,))
         return _alignment(guess, sfm, transl), report
     rays = {
@@ -154,7 +156,7 @@ def align(
     transl = {side: track.transl + shifts[side][:, None] * rays[side] for side, track in hands.items()}
     notes = []
     if abs(np.log(factor)) > config.span - step:
-        notes.append("the object's size is at the end of the search: look at the hands' size and depth")
+        notes.append("the object's size is at the end of the search range: check the hands' size and depth")
     report = AlignReport(touching, factors, costs, shifts, tuple(notes))
     return _alignment(guess * factor, sfm, transl), report
 

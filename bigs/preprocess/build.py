@@ -98,7 +98,7 @@ def write_build(
     build = clip / "build"
     if build.exists() and not ours:
         raise InputError(
-            f"{build}: expected no such folder or one that was made here, found another's; "
+            f"{build}: expected no folder or one that bigs made, found another; "
             "move it away or choose another --out"
         )
     shift = scene_shift(sfm, alignment)

@@ -39,8 +39,7 @@ def check_plan(config: RunConfig) -> None:
     for earlier, stage in pairwise(config.stages):
         if isinstance(stage, ObjectMotionStage):
             raise InputError(
-                f"config stages.{stage.name}: expected it first, since all is built on it, "
-                f"found it after {earlier.name}"
+                f"config stages.{stage.name}: expected this stage first, found it after {earlier.name}"
             )
     for stage in config.stages:
         where = f"config stages.{stage.name}"

@@ -151,7 +151,9 @@ def fit(
         if isinstance(stage, ScaleSearchStage):
             size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {size.text()}"})
-            report.facts["object size"] = f"last corrected by x {size.text()}, by where hands touch it"
+            report.facts["object size"] = (
+                f"last corrected by a factor of {size.text()}, by where hands touch it"
+            )
         elif isinstance(stage, GraspStage):
             grasps = find_grasps(scene, stage, sources.meeting, sources.mismatch(stage))
             for side, found in grasps.items():
@@ -172,7 +174,7 @@ def fit(
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
             if last.step < stage.steps:
                 report.skipped.append(
-                    f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had settled"
+                    f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had converged"
                 )
             if last.pull is not None:
                 now = len(scene.object_splats.base_points)
@@ -286,7 +288,7 @@ def _not_needed(stage: Stage, scene: Scene) -> str | None:
     if not stage.weights:
         return "no loss term is left"
     if stage.free_frames and not any(len(scene.free_frames(side)) for side in scene.sides):
-        return "in every frame the hands hold the object"
+        return "the hands hold the object in every frame"
     # The clip's light and shade alone are no subject.
     subjects = {group.split(".")[0] for group in stage.lrs} - {"scene"}
     if subjects == {"hand"} and not scene.sides:

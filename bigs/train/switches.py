@@ -55,7 +55,7 @@ def without_all(config: RunConfig, names: Iterable[str]) -> tuple[RunConfig, lis
         if less == config:
             unused.append(name)
         if not any(isinstance(stage, OptimizeStage) for stage in less.stages):
-            raise InputError(f"--without {name}: expected a stage that is left to run, found none")
+            raise InputError(f"--without {name}: expected at least one stage to remain, found none")
         config = less
     return config, unused
 
@@ -154,7 +154,7 @@ _INGREDIENTS = {
         lambda config: replace(config, hand=replace(config.hand, shared=False)),
     ),
     "prior": Switch(
-        "what completes the object where it was never seen",
+        "the completion of the object where it was never seen",
         _no_prior,
     ),
     "smooth": Switch(
@@ -162,10 +162,10 @@ _INGREDIENTS = {
         _all_of(_terms("smooth", "acceleration"), _smooth),
     ),
     "contact": Switch(
-        "contact and penetration, and the search of the object's size that they decide",
+        "contact and penetration, and the search of the object's size, which they decide",
         _all_of(_terms("contact", "penetration"), _scale_search),
     ),
-    "frame_poses": Switch("residuals of the poses of single frames", _groups(*_FRAME_POSES)),
+    "frame_poses": Switch("pose residuals of single frames", _groups(*_FRAME_POSES)),
     "object-motion": Switch(
         "the object's motion from tracks in its pictures",
         lambda config: _keep(config, leave_out=ObjectMotionStage),
@@ -179,9 +179,9 @@ _INGREDIENTS = {
         "grasps, in which the object carries a hand",
         _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),
     ),
-    "free_frames": Switch("steps for the frames between grasps alone", _free_frames),
+    "free_frames": Switch("the steps for frames between grasps", _free_frames),
     "frame_moments": Switch(
-        "moments of each frame's own for turns and fingers",
+        "separate Adam moments for each frame's rotations and fingers",
         lambda config: _keep(config, lambda stage: replace(stage, frame_moments=False)),
     ),
     "lighting": Switch(
@@ -193,26 +193,26 @@ _INGREDIENTS = {
         ),
     ),
     "labels": Switch(
-        "who hides whom: the label term, also in the search of the object's size",
+        "the label term (who hides whom), also in the search of the object's size",
         _all_of(_terms("labels"), _search_labels),
     ),
     "pose_priors": Switch(
-        "the pull of poses, depths and shape to their estimates",
+        "the priors that hold poses, depths and shape near their estimates",
         _terms("orient_prior", "pose_prior", "depth_prior", "betas_prior", "object_prior"),
     ),
     "hand_geometry": Switch(
-        "what moves, turns and scales the hand's Gaussians",
+        "offsets, rotations and scales of the hand's Gaussians",
         _all_of(
             lambda config: replace(config, hand=replace(config.hand, learn_geometry=False)),
             _groups("hand.geometry", "hand.shift", "hand.size"),
         ),
     ),
     "densify": Switch(
-        "the object's Gaussians that are cloned, split and pruned",
+        "cloning, splitting and pruning of the object's Gaussians",
         lambda config: _keep(config, lambda stage: replace(stage, densify=None)),
     ),
     "split": Switch(
-        "Gaussians that leave their fields, the object's in finer parts",
+        "free Gaussians: fields stay to the end, as in the paper",
         lambda c: _keep(c, leave_out=SplitStage),
     ),
     "pyramid": Switch("coarse images before fine ones", _pyramid),

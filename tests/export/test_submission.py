@@ -170,6 +170,6 @@ def test_damaged_zips_are_named(tmp_path: Path, archive: Path, predictions: list
     with pytest.raises(InputError, match="expected a zip file"):
         check_submission(archive, NAMES)
     predictions[0].write_bytes(b"junk")
-    with pytest.raises(InputError, match="found what cannot be read safely"):
+    with pytest.raises(InputError, match="found data that cannot be read safely"):
         write_submission(tmp_path / "new.zip", predictions, NAMES)
     assert not (tmp_path / "new.zip").exists()

@@ -202,10 +202,10 @@ class Bomb:
     [
         ("missing", "expected a file with VGG-16, found no such file"),
         ("folder", "expected a file with VGG-16, found a folder"),
-        ("text", "expected tensors by name .* found what cannot be read safely"),
-        ("empty", "expected tensors by name .* found what cannot be read safely"),
+        ("text", "expected tensors by name .* found data that cannot be read safely"),
+        ("empty", "expected tensors by name .* found data that cannot be read safely"),
         ("cut short", "expected tensors by name .* found file is not a zip file"),
-        ("code", "expected tensors by name .* found what cannot be read safely"),
+        ("code", "expected tensors by name .* found data that cannot be read safely"),
         ("list", "expected tensors by name, found list"),
         ("channels alone", "expected VGG-16 as torchvision names it, found no features.0.weight"),
         ("a layer", "found no features.17.bias"),

@@ -113,5 +113,5 @@ def test_unknown_names_are_refused() -> None:
 def test_a_plan_does_not_become_empty() -> None:
     only = replace(FAST.stages[1], weights={"silhouette": 1.0})
     plan = RunConfig(object=ObjectSplatsConfig(), stages=(only, ScaleSearchStage()))
-    with pytest.raises(InputError, match="--without silhouette: expected a stage that is left to run"):
+    with pytest.raises(InputError, match="--without silhouette: expected at least one stage to remain"):
         without_all(plan, ["silhouette"])

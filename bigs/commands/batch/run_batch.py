@@ -137,7 +137,7 @@ def _work(plan: BatchPlan, engine: Engine, waiting: deque[Job], at_once: int, li
         status = read_status(job.run.folder)
         if status.state != "finished":
             if death or status.state != "failed":
-                error = death or "its worker ended without a word"
+                error = death or "its worker ended without a result"
                 status = replace(status, state="failed", error=error, again=True, batch=job.batch)
                 status = replace(status, attempts=tries[job.name])
             if status.again and tries[job.name] <= plan.retries:

@@ -69,7 +69,8 @@ def convert(
     if clip.annotated and not plan.from_truth:
         raise InputError(
             f"{source}: expected a clip with initial estimates, found a data set's ground truth "
-            "(--from-truth starts from it, which is not fair; bigs preprocess estimates from the images)"
+            "(bigs preprocess makes estimates from its images; "
+            "--from-truth starts from the truth, to study what follows)"
         )
     if plan.masks is not None:
         masks = list_frames(plan.masks, MASK_SUFFIXES)

@@ -109,7 +109,7 @@ def evaluate_run(
         # A data set's poses are its truth on the hand that they were fitted with, and on no other.
         hand_models = load_hand_models(hand_file)
         if hand_file is None:
-            remarks.append("the data set's poses are on the built-in hand (--hand-model gives theirs)")
+            remarks.append("the data set's poses are on the built-in hand; give theirs with --hand-model")
     clip = _open_frames(clip_path, hand_models, playback, given=plan.clip is not None)
     if clip is None and truth_path is None and plan.novel is None:
         raise InputError(
@@ -133,7 +133,7 @@ def evaluate_run(
         order = match_frames(truth.frame_names, playback.frame_names)
         frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
     if clip is None:
-        remarks.append("pictures are not scored: the run's clip is not there (--clip)")
+        remarks.append("pictures are not scored: the run's clip was not found (--clip)")
     else:
         listen(f"{run.name}: pictures")
         pictures = frame_scores(clip, playback, distance)

@@ -35,9 +35,7 @@ def load_run(run: Path) -> Playback:
     if not (run / SCENE).exists() and not (run / CONFIG).exists():
         inside = sorted(scene.parent for scene in run.glob(f"*/{SCENE}"))
         if inside:
-            raise InputError(
-                f"{run}: expected a run folder, found one with runs in it{meant(str(inside[0]))}"
-            )
+            raise InputError(f"{run}: expected a run folder, found a folder of runs{meant(str(inside[0]))}")
     return load_playback(run / SCENE)
 
 

@@ -32,7 +32,7 @@ def only_writer(folder: Path) -> Iterator[None]:
         except OSError as error:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
                 raise InputError(
-                    f"{folder}: expected a run that rests, found another process at it"
+                    f"{folder}: expected a run that no other process works on, found one at work"
                 ) from None
         yield
     finally:

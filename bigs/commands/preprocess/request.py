@@ -62,6 +62,6 @@ def kept(
     """The outcome of a step that has nothing to do."""
     shown = picture if picture.exists() else None
     if state == "supplied":
-        notes = (*notes, "kept as another tool supplied it; remove it, or pass --redo, to have it made")
+        notes = (*notes, "kept as supplied by another tool; remove it or pass --redo to make it again")
         return StepOutcome(name, "supplied", summary, notes, shown)
     return StepOutcome(name, "up to date", summary, notes, shown)

@@ -202,7 +202,7 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     masks = np.stack([read_mask(path) for path in mask_paths(processed, frames)])
     sfm = read_object_sfm(processed / SFM_FILE, count)
     alignment = read_alignment(processed / ALIGNED_FILE, count)
-    listen("points where silhouettes tell the surface")
+    listen("points where silhouettes determine the surface")
     completed = complete_points(sfm, alignment, lambda t: read_image(paths[t]), masks, frames.K, config)
     build = write_build(
         request.clip,

@@ -118,8 +118,8 @@ def _coverage(clip: Clip, playback: Playback) -> tuple[str, Image.Image] | None:
     usual = np.median(areas[areas > 0]) if (areas > 0).any() else 1.0
     found = coverage_map(to_camera.numpy(), areas > _HIDDEN * usual)
     caption = (
-        "directions in which the object's surface may face: blue was in view, the darker the more often, red "
-        "never; dots are the camera's places around it"
+        "directions in which the object's surface may face: blue was in view (darker: more often), red was "
+        "never; dots are the camera's positions"
     )
     return caption, found.picture
 

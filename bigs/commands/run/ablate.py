@@ -155,7 +155,7 @@ def ablation_table(rows: list[Row], done: dict[str, FinishedRun], unused: dict[s
             seconds = "-" if resumed else f"{run.times['wall']:.0f}"
             body.append((label, *(_score(run.scores["result"], key) for key in _SCORES), seconds))
             notes += [f"{label}: continued after an interruption, not timed."] if resumed else []
-            notes += [f"{label}: this plan has nothing of {name}." for name in unused[row.name]]
+            notes += [f"{label}: this plan does not contain {name}." for name in unused[row.name]]
         if row.paper is not None:
             body.append(_paper_cells(row.paper))
     initial = next((run.scores["initial"] for run in done.values() if "initial" in run.scores), None)

@@ -307,5 +307,5 @@ def _one_each(
 
 def _some(file: Path, found: dict[Side, Dump]) -> dict[Side, Dump]:
     if not found:
-        raise InputError(f"{file}: expected a hand in some frame, found none in any")
+        raise InputError(f"{file}: expected a hand in at least one frame, found none")
     return found

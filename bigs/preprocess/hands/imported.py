@@ -63,7 +63,7 @@ def import_hands(
             notes.append(f"{side} hand: no estimate in {frame_ranges(~valid)}, filled from the frames around")
         kept[side] = _filled(track, valid)
     if not kept:
-        raise InputError("hands: expected a frame in which a hand is on its own place, found none")
+        raise InputError("hands: expected a frame in which a hand lies on its own mask, found none")
     return HandEstimates(kept, tuple(notes))
 
 

@@ -87,7 +87,7 @@ def fit_hands(
         if not valid.all():
             notes.append(f"{side} hand: no estimate in {frame_ranges(~valid)}, filled from the frames around")
     if not tracks:
-        raise InputError("keypoints: expected a hand, found none that any pose of a hand explains")
+        raise InputError("keypoints: expected points that the pose of a hand explains, found none")
     return HandEstimates(tracks, tuple(notes))
 
 

@@ -68,12 +68,12 @@ class SfmReport(NamedTuple):
 
 
 _EXPLAINED = {
-    "few points": "too few points of the object were seen, so its motion before and after stands in",
-    "tied loosely": "hardly any point ties them to the rest, so their turn may be off by several degrees",
-    "depth may be reversed": "its mirror image in depth fits better, so the turn may be the wrong way",
-    "turn changes": "the turn changes abruptly; look whether the hand really did that",
+    "few points": "too few points of the object were seen; its motion before and after was used",
+    "tied loosely": "few points connect them to the rest, so their rotation may be off by several degrees",
+    "depth may be reversed": "its mirror image in depth fits better, so the object may turn the other way",
+    "turn changes": "the rotation changes abruptly; check that the object really did that",
     "long step": "the object jumps between two frames",
-    "models disagree": "a model made of them alone turns otherwise, so their turn may be off",
+    "models disagree": "a partial model of these frames disagrees, so their rotation may be off",
 }
 
 

@@ -192,7 +192,8 @@ def run_stage(
 def _field_of_object(scene: Scene, stage: OptimizeStage) -> ObjectSplats:
     if not isinstance(scene.object_splats, ObjectSplats):
         raise InputError(
-            f"stage {stage.name}: expected densify where the object has a field, found Gaussians of their own"
+            f"stage {stage.name}: expected densify in a stage in which the object has a field, "
+            "found free Gaussians"
         )
     return scene.object_splats
 

@@ -159,7 +159,7 @@ def _object_surfaces(
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid)
-        why = f"object surface from masks: {reason}; the points' convex hull stands in for it"
+        why = f"object surface from masks: {reason}; using the points' convex hull instead"
         return _ObjectSurfaces(closed, None, grid, [], [why])
     support = Support(
         seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points

@@ -88,7 +88,7 @@ def in_words(motion: TrackedMotion) -> str:
     """What a person should know of it."""
     error = np.degrees(turn_errors(motion))
     text = (
-        f"{len(motion.points)} points, turns known to {np.median(error):.2f} degrees (given to "
+        f"{len(motion.points)} points, rotation known to {np.median(error):.2f} degrees (given to "
         f"{np.degrees(motion.turn_sigma):.2f})"
     )
     wrong = np.flatnonzero(motion.contradicted)

@@ -103,7 +103,7 @@ def complete_scene(
     if change > stage.most_worsening:
         scene.object_splats = splats
         scene.replace_surface(surface)
-        reason = f"undone, since the clip's frames would show worse ({change:+.1%} error)"
+        reason = f"undone, since the clip's frames would look worse ({change:+.1%} error)"
         return CompletedScene(reason, facts)
     facts["object completed"] = f"{found}; error of the clip's frames {change:+.1%}"
     return CompletedScene(None, facts)

@@ -98,8 +98,8 @@ def guide_scene(
     strange = strangeness(canonical, coverage, orbit, denoiser, stage, evidence.settings)
     if strange > stage.unlike:
         reason = (
-            f"left out, since the prior knows no such object: about what was seen of it, it is {strange:.1f} "
-            f"times as wrong as about what it learned from ({stage.unlike} is allowed)"
+            f"left out, since the prior does not know this object: on its seen sides it is {strange:.1f} "
+            f"times as wrong as on its own meshes ({stage.unlike} is allowed)"
         )
         return CompletedScene(reason, facts)
     # What shows in any frame stays, even where too few show it to be sure of it.
@@ -127,7 +127,7 @@ def guide_scene(
         after_step,
     )
     if done.rolled_back:
-        reason = f"undone, since the clip's frames would show worse ({done.worst:+.1%} error or size)"
+        reason = f"undone, since the clip's frames would look worse ({done.worst:+.1%} error or size)"
         return CompletedScene(reason, facts)
     _put_back(scene, evidence, detail, found, held.seen)
     with torch.no_grad():
@@ -136,7 +136,7 @@ def guide_scene(
     looked = float((coverage.by_direction < stage.well_seen).float().mean())
     facts["prior"] = (
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
-        f"error of what was seen {done.worst:+.1%} at most"
+        f"error of the seen part {done.worst:+.1%} at most"
     )
     return CompletedScene(None, facts)
 

@@ -71,7 +71,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     assert rows[2][1] == "46.11" and rows[4][1] == "96.55"
     assert rows[3][2] == "2.50" and rows[6][2] == "1.50"
     assert "datasets differ" in found.table.note
-    assert f"{idle}: this plan has nothing of {idle}." in found.table.note
+    assert f"{idle}: this plan does not contain {idle}." in found.table.note
 
     page = (tmp_path / "out" / "ablation.md").read_text()
     assert page.count("| (the paper) |") == 2 and "datasets differ" in page
@@ -82,7 +82,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     assert numbers["full"]["paper"]["cd_l_sq"] == 46.11
     assert numbers["full"]["scores"]["result"]["cd_r_sq"] == 0.5
     assert numbers["full"]["times"]["stages"]["joint"]["steps"] == 1
-    assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had settled"]
+    assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had converged"]
 
 
 def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def test_hamers_formula_is_that_of_its_crop() -> None:
     [
         ({"poses": np.zeros(3)}, "expected j3d.right"),
         ({"j3d.right": np.zeros((T, 20, 3))}, "j3d.right: expected shape [T, 21, 3]"),
-        ({"j3d.right": np.full((T, 21, 3), np.nan)}, "expected a hand in some frame, found none"),
+        ({"j3d.right": np.full((T, 21, 3), np.nan)}, "expected a hand in at least one frame, found none"),
         ({"j3d.right": np.zeros((T + 1, 21, 3))}, "expected 8 (one for each frame)"),
         ({"right": {"global_orient": np.zeros((T, 3))}}, "right.transl: expected this field"),
         ({"right": np.ones(2), "global_orient": np.zeros((2, 5))}, "expected 1 rotation matrices"),

@@ -271,7 +271,9 @@ def test_the_same_seed_gives_the_same_gaussians(both_hands: dict[Side, HandModel
 def test_gaussians_without_a_field_are_refused(scene: Scene, evidence: Evidence) -> None:
     with torch.no_grad():
         scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
-    with pytest.raises(InputError, match="stage alone: expected densify where the object has a field, found"):
+    with pytest.raises(
+        InputError, match="stage alone: expected densify in a stage in which the object has a field, found"
+    ):
         run_stage(scene, replace(STAGE, lrs={**LRS, "hand.ray": 1e-3}), evidence, 0)
 
 

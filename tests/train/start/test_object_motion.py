@@ -133,5 +133,5 @@ def test_it_can_be_left_out_and_stands_first_where_it_is() -> None:
         assert less.stages == PRESETS[name].stages[1:]
     late: RunConfig = replace(FAST, stages=(*FAST.stages[1:3], STAGE))
     assert isinstance(late.stages[0], OptimizeStage)
-    with pytest.raises(InputError, match="expected it first"):
+    with pytest.raises(InputError, match="expected this stage first"):
         check_plan(late)

@@ -92,7 +92,7 @@ def test_a_prior_that_does_not_know_the_object_is_left_out(
     knowing = PixelDenoiser(prior.net, familiar=1e-4)
     before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
     after, report = run(one_side, both_hands, PLAN, knowing)
-    assert "the prior knows no such object" in report.skipped[0]
+    assert "the prior does not know this object" in report.skipped[0]
     for name, value in before.state_dict().items():
         torch.testing.assert_close(after.state_dict()[name], value, rtol=0, atol=0)
     broad = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, unlike=1e9, damage=1e9)))
