@@ -3,8 +3,8 @@
 import os
 from importlib.metadata import version
 
-# OpenMP threads that wait for each other by spinning stop all progress as soon as another program wants a
-# core: a step of 0.4 s was measured at 5.6 s. Read once, when torch is first imported.
+# OpenMP threads that spin while they wait block the renderer's threads, and any other program makes that many
+# times worse (docs/design/waiting-threads.md). torch reads this once, on import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = version("bigs")

@@ -18,14 +18,14 @@ import numpy as np
 from bigs.checks import ARCHIVE_ERRORS, InputError, shown
 from bigs.files import MIB, open_regular
 
-# An archive may unpack to this, whatever its size, and to so many times its size besides: tracks of a hand
-# that never moves are constant and shrink a hundredfold, clips that move hardly shrink at all.
+# An archive may always unpack to this many bytes, or to this many times its own size: constant tracks
+# compress a hundredfold, moving ones hardly at all.
 MAX_UNPACKED_BYTES = 256 * MIB
 MAX_RATIO = 16
-# A file of poses has 30.
+# A poses file has 30 members.
 MAX_MEMBERS = 10_000
 
-# Others unpack in steps whose size nobody bounds.
+# Other compressions unpack in steps of unbounded size.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _HEADER_ERRORS: tuple[type[Exception], ...] = (
     *ARCHIVE_ERRORS,
@@ -81,7 +81,7 @@ def read_member(where: str, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -
         InputError: it is damaged or encrypted.
     """
     try:
-        # Without a size, a member is unpacked whole before it is cut to what was announced.
+        # Without a size, the whole member would be unpacked before it is cut.
         with archive.open(member) as stream:
             return stream.read(member.file_size)
     except ARCHIVE_ERRORS as error:
@@ -151,7 +151,7 @@ def npy_header(where: str, stream: BinaryIO) -> tuple[tuple[int, ...], np.dtype]
         if version not in _HEADERS:
             raise ValueError(f"format version {version}")
         shape, _, dtype = _HEADERS[version](stream)
-    # The header is a literal that Python parses; damage shows up in many ways, and so does deep nesting.
+    # The header is a Python literal; damage and deep nesting raise many kinds of errors.
     except _HEADER_ERRORS as error:
         reason = str(error).splitlines() or [type(error).__name__]
         raise InputError(f"{where}: expected an .npy array, found {reason[0]}") from None

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-# How the temporary files end.
+# Suffix of temporary files.
 _PART = ".part"
 
 

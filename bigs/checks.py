@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-# What numpy and zipfile raise of an archive that is damaged (a flipped bit may look like any), encrypted or
-# of an unknown compression (both RuntimeError).
+# What numpy and zipfile raise for an archive that is damaged, encrypted or of an unknown compression.
 ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
     OSError,
     ValueError,
@@ -29,22 +28,22 @@ ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
 )
 
 
-# Of a picture: twice as many as 8K video has. One takes 200 MB as bytes of three colours.
+# Limit of a picture: twice 8K video, or 200 MB as bytes of three colours.
 MAX_PIXELS = 1 << 26
-# Of a mesh in all frames: 1200 frames, as ARCTIC's longest sequence has, of 80 000 vertices. In double
-# precision these take 2.4 GB.
+# Limit of a mesh over all frames: 1200 frames (ARCTIC's longest sequence) of 80 000 vertices, 2.4 GB in
+# double precision.
 MAX_MOVED_VERTICES = 100_000_000
-# Rotations are kept in float32 and in print with six digits.
+# Rotations are stored as float32 and printed with six digits.
 ROTATION_TOLERANCE = 1e-3
-# How much of a value from a file a message shows.
+# Messages show this much of a value from a file.
 _SHOWN = 80
 _BRIEFLY = reprlib.Repr()
 _BRIEFLY.maxlevel, _BRIEFLY.maxstring, _BRIEFLY.maxother, _BRIEFLY.maxlong = 3, _SHOWN, _SHOWN, _SHOWN
-# Longer lists of accepted names than this are not recited where one of them is near enough.
+# Longer lists of accepted names are left out of a message if one of them is close.
 _MOST_RECITED = 12
-# How alike two names must be, 0 to 1, to be taken for each other.
+# Similarity of two names, 0 to 1, from which one is suggested for the other.
 _ALIKE = 0.6
-# Of larger folders not every file is compared with one that is not there.
+# In larger folders not every file is compared with a missing one.
 _MOST_NEIGHBOURS = 1000
 
 
@@ -136,7 +135,7 @@ def shown(value: Any) -> str:
         return f"an array of shape {list(value.shape)}"
     try:
         text = " ".join(_BRIEFLY.repr(value).split())
-    except Exception:  # a value may raise whatever it likes
+    except Exception:  # repr of a foreign value may raise anything
         return f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
 
@@ -151,7 +150,7 @@ def check_choice(name: str, value: Any, choices: Iterable[Any], kind: str = "nam
         kind: what the choices are ("terms"), for lists that are too long to be recited.
     """
     accepted = list(choices)
-    # An array is no choice, and compares entry by entry.
+    # An array cannot be a choice, and would compare entry by entry.
     if isinstance(value, np.ndarray | torch.Tensor) or value not in accepted:
         raise InputError(f"{name}: {expected_among(value, accepted, kind)}")
 

@@ -17,7 +17,7 @@ __all__ = ["pycolmap"]
 def _give_back_sigterm() -> None:
     """Put back what Python knows to be the handler, which importing pycolmap did not ask about."""
     handler = signal.getsignal(signal.SIGTERM)
-    # Only the main thread may, and a handler that Python did not set it cannot put back.
+    # Only the main thread can set handlers, and it cannot restore a handler that Python did not set.
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)
 

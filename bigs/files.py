@@ -19,15 +19,15 @@ import yaml
 from bigs.checks import InputError, meant, neighbour, shown
 
 MIB = 1 << 20
-# JSON for 2000 frames of keypoints of two hands is 8 MB; parsed, a file takes some twenty times its size.
+# JSON keypoints of two hands in 2000 frames are 8 MB; parsed, a file takes some twenty times its size.
 MAX_TEXT_BYTES = 64 * MIB
-# A configuration has 10 kB and a manifest of 5000 clips 500 kB; YAML is read at about 1 MB a second.
+# A configuration has 10 kB, a manifest of 5000 clips 500 kB. YAML is read at about 1 MB per second.
 MAX_YAML_BYTES = 2 * MIB
-# Of a YAML document, counted as if every alias were written out.
+# Limit of a YAML document with every alias written out.
 MAX_YAML_NODES = 200_000
-# JSON and YAML of ours go five levels deep.
+# bigs's own JSON and YAML are five levels deep.
 MAX_DEPTH = 50
-# Longer whole numbers are no measurement; Python would take time that grows with the square of their digits.
+# No measurement has more digits, and parsing time grows with their square.
 MAX_DIGITS = 100
 _TOO_LARGE = 10**MAX_DIGITS
 # Arrays, videos, weights of networks.
@@ -46,9 +46,9 @@ def open_regular(path: str | Path, what: str, most: int = MAX_FILE_BYTES) -> Bin
         InputError: there is no such file; it is a folder, pipe or device; it is too large or cannot be read.
     """
     try:
-        # Without waiting for somebody to write into what may be a pipe.
+        # Non-blocking, since the path may be a pipe without a writer.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    except (OSError, ValueError) as error:  # the latter for a path with NUL
+    except (OSError, ValueError) as error:  # ValueError for a path with NUL
         raise InputError(f"{path}: expected {what}, found {_no_file(error, path)}") from None
     try:
         _check(os.fstat(handle), path, what, most)
@@ -116,7 +116,7 @@ def parse_json(where: str, text: str) -> Any:
         document = json.loads(text)
     except RecursionError:
         raise InputError(f"{where}: expected JSON of at most {MAX_DEPTH} levels, found more") from None
-    except ValueError as error:  # a JSONDecodeError, or of a number with thousands of digits
+    except ValueError as error:  # a JSONDecodeError, or a number with thousands of digits
         raise InputError(f"{where}: expected JSON, found {error}") from None
     _check_values(where, document)
     return document
@@ -135,7 +135,7 @@ def parse_yaml(where: str, text: str) -> Any:
     except yaml.YAMLError as error:
         raise InputError(f"{where}: expected YAML, found {' '.join(str(error).split())}") from None
     except (ValueError, OverflowError, TypeError, RecursionError) as error:
-        # Of values that look like dates or numbers and are none, and of keys that are lists.
+        # Values that look like dates or numbers but are none, and keys that are lists.
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: expected YAML, found {shown(str(error))}") from None
@@ -143,13 +143,13 @@ def parse_yaml(where: str, text: str) -> Any:
     return document
 
 
-# The loader in C is ten times as fast, where PyYAML was built with it.
+# The C loader is ten times as fast, where PyYAML has it.
 _YamlLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def _check_yaml(where: str, text: str) -> None:
     """Walk over the events of a document, which takes no memory, and count what it would unfold to."""
-    sizes: dict[str, int] = {}  # of what anchors stand for
+    sizes: dict[str, int] = {}  # number of nodes that each anchor stands for
     open_nodes: list[tuple[str | None, int]] = []  # anchor, and nodes counted before it began
     count = 0
     for event in yaml.parse(text, Loader=_YamlLoader):
@@ -216,7 +216,7 @@ def _no_file(error: OSError | ValueError, path: str | Path) -> str:
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.ENOENT, errno.ENOTDIR) or number is None:
         return f"no such file{meant(neighbour(path))}"
-    # What Windows says of folders, and a socket of being opened.
+    # Windows reports this for folders, Linux for sockets.
     if number in (errno.EACCES, errno.ENXIO) and not os.path.isfile(path):
         return "no regular file"
     return f"one that cannot be opened ({os.strerror(number)})"

@@ -9,13 +9,12 @@ from typing import Any
 
 from bigs.checks import InputError, shown
 
-# File systems allow 255 bytes; what writers add to a name (".safetensors", a temporary file's suffix) has to
-# fit, too.
+# File systems allow 255 bytes, and suffixes (".safetensors", temporary files) must fit too.
 MAX_NAME_BYTES = 200
-# Of a whole path, which systems limit to 4096 bytes.
+# Of a whole path; systems allow 4096 bytes.
 _MAX_PATH_BYTES = 4000
 _MAX_PART_BYTES = 255
-# Windows has devices of these names in every folder, whatever suffix follows.
+# Windows has devices of these names in every folder, with any suffix.
 _DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9¹²³])", re.IGNORECASE)
 
 
@@ -76,7 +75,7 @@ def _text_reason(text: Any) -> str:
         return f"{type(text).__name__}, not text"
     if not text:
         return "empty"
-    # A short look at a long text: what is wrong with its length is told in any case.
+    # A long text is cut; the message states its length anyway.
     if any(unicodedata.category(letter) in ("Cc", "Zl", "Zp") for letter in text[: 4 * _MAX_PATH_BYTES]):
         return "a control character"
     try:

@@ -21,16 +21,16 @@ Global = tuple[str, str]
 
 # A clip of 2000 frames takes 80 000 operations, MANO's own file 300.
 MAX_OPERATIONS = 500_000
-# Values in a part when everything shared is written out, and values that are hashed as keys in all.
+# Limits of values in a part with everything shared written out, and of values in keys.
 MAX_VALUES = 1_000_000
-# Data sets nest five levels deep; hashing and printing use the stack of the machine for each level.
+# Data sets nest five levels deep; hashing and printing use the machine's stack for each level.
 MAX_DEPTH = 50
-# No data set has longer integers, and such keys can be made to collide; a field may hold a wrong one.
+# No data set has longer integers as keys, and such keys can be made to collide.
 _LONG_INTEGER, _MAX_LONG_INTEGERS = 1 << 64, 1000
-# Arguments of what may be called; a tensor has seven.
+# Most arguments of a callable; a tensor has seven.
 _MAX_ARGUMENTS = 16
 
-# Classes whose instances are dictionaries: the second is what HOLD saves its predictions as.
+# Classes whose instances are dictionaries; HOLD saves its predictions as the second.
 HOLD_DICTIONARY: Global = ("common.xdict", "xdict")
 DICTIONARIES: frozenset[Global] = frozenset({("collections", "OrderedDict"), HOLD_DICTIONARY})
 

@@ -33,9 +33,9 @@ _DTYPES: dict[str, torch.dtype] = {
 }
 _PARAMETER: Global = ("torch._utils", "_rebuild_parameter")
 _ALLOW = TENSORS | {("torch", "BFloat16Storage"), _PARAMETER, HOLD_DICTIONARY}
-# How zip files begin, as which torch saves since version 1.6; weights of VGG-16 are older than that.
+# The first bytes of a zip file, which torch saves since version 1.6; VGG-16's weights are older.
 _ZIP_MAGIC = b"PK\x03\x04"
-# Of the pickle in such a file; that of a network with 10 000 tensors has 2 MB.
+# Limit of the pickle in such a file; that of a network with 10 000 tensors has 2 MB.
 _MAX_PICKLE_BYTES = 64 << 20
 
 
@@ -109,7 +109,7 @@ class _TorchBuilder(Builder):
             )
         if not data:
             return torch.empty(0, dtype=announced.dtype)
-        # A copy, because torch has no tensors that must not be written.
+        # A copy, because torch has no read-only tensors.
         return torch.frombuffer(bytearray(data), dtype=announced.dtype)
 
 

@@ -39,11 +39,11 @@ from bigs.pickle_records import (
 )
 
 _DTYPE_CODE = re.compile(r"[<>|=]?(b1|\?|[iu][1248]|f[248]|c8|c16|S\d+|U\d+|O[48]?)")
-# Bytes that are made for each byte of a file: text becomes bytes, a storage, a tensor. Small files get more.
+# Memory per byte of a file: text becomes bytes, a storage, a tensor. Small files may use more.
 _MADE_PER_BYTE, _MADE_AT_LEAST = 8, 32 << 20
-# What a member of a list, dictionary or set takes, in bytes.
+# Bytes per member of a list, dictionary or set.
 _BYTES_PER_MEMBER = 64
-# Of a sparse matrix that will be made dense: 4000 vertices have 64 000 in MANO's.
+# Limit of a sparse matrix that will be made dense; MANO's 4000 vertices have 64 000.
 MAX_SPARSE_VALUES = 1 << 24
 _TORCH_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
@@ -112,7 +112,7 @@ class Builder:
         self._sizes: dict[int, int] = {}  # of results, with everything shared written out
         self._done: dict[int, Any] = {}
         self._active: set[int] = set()
-        # Keeps every visited object alive, so that an id in `_done` cannot come to mean another object.
+        # Keeps every visited object alive, so that an id in `_done` is not used again.
         self._alive: list[Any] = []
 
     def value(self, raw: Any) -> Any:
@@ -323,7 +323,7 @@ def _build_sparse(builder: Builder, record: Record) -> Any:
         )
     builder.spend(sum(part.nbytes for part in parts))
     matrix = matrix_type(parts, shape=shape)
-    # SciPy's compiled loops trust the indices; this is what looks at every one of them.
+    # SciPy's compiled loops do not check the indices, so every one is checked here.
     matrix.check_format(full_check=True)
     return matrix
 
@@ -345,7 +345,7 @@ def _build_tensor(builder: Builder, record: Record) -> torch.Tensor:
     if not isinstance(storage, torch.Tensor):
         raise TypeError("a torch tensor without a storage")
     size, stride = _shape(size), _shape(stride)
-    # A stride of 0 could announce a tensor far larger than the file that holds it.
+    # With a stride of 0, a tensor could be far larger than its file.
     if math.prod(size) > storage.numel():
         raise ValueError(f"a torch tensor of size {list(size)} in a storage of {storage.numel()} values")
     tensor = storage.as_strided(size, stride, offset)

@@ -62,14 +62,14 @@ GROUPS = {
     "bench": "Measure speed and accuracy.",
 }
 
-# What torch, FFmpeg and the system say where Python would raise MemoryError.
+# Texts of torch, FFmpeg and the system where Python would raise MemoryError.
 _NO_MEMORY = re.compile(
     r"can't allocate memory|cannot allocate memory|std::bad_alloc|out of memory", re.IGNORECASE
 )
-# How much of the text of an error that nobody foresaw is told.
+# Length of an unexpected error's text in the message.
 _REASON = 200
 
-# Groups that may be called without naming one of their commands.
+# Groups that may be called without a subcommand.
 IMPLIED = {"preprocess": "all"}
 
 
@@ -149,7 +149,7 @@ def _parse(arguments: list[str]) -> Callable[[], None]:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        # The parser draws a box of several lines; its words are kept, its frame and title are not.
+        # The parser draws a box of several lines; only its words are kept.
         lines = [line for line in said.getvalue().splitlines() if not line.startswith("╭")]
         words = " ".join(re.sub(r"[╰╯│─]+", " ", " ".join(lines)).split())
         fail(words, 2)
@@ -166,7 +166,7 @@ def _choice_of(commands: Commands) -> Any:
 
         return bind
 
-    # A union has at least two members; the one that says nothing is hidden.
+    # A union needs at least two members; the empty one is hidden.
     options: list[Any] = [Annotated[None, tyro.conf.Suppress]]
     for name, command in commands.items():
         if callable(command):

@@ -9,7 +9,7 @@ import tyro
 
 from bigs.cli.terminal import Preset, fail_for, print_tables, telling, use_threads
 
-# The names of `bench.workloads.KINDS`, `bench.plan.PARTS` and `bench.peers.PEERS`; a test compares.
+# The names of `bench.workloads.KINDS`, `bench.plan.PARTS` and `bench.peers.PEERS`; a test compares them.
 Workload = Literal["A", "B", "C", "D"]
 Part = Literal["levels", "stages", "memory", "skips", "curve", "peers"]
 Peer = Literal["gsplat"]

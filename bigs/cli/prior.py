@@ -9,7 +9,7 @@ import tyro
 
 from bigs.cli.terminal import ClipPath, say, stderr, use_threads
 
-# As `guidance.diffusers_folder` has them, spelled out because importing that takes seconds; a test compares.
+# The names in `guidance.diffusers_folder`, whose import takes seconds; a test compares them.
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "float16", "bfloat16"]
 

@@ -27,13 +27,13 @@ from bigs.cli.terminal import (
 if TYPE_CHECKING:
     from bigs.commands.run.reconstruct import Outcome
 
-# An option that is there or not, without a "--no-" of its own.
+# A flag without a "--no-" form.
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
-# "auto", or the names of `train.plan.config.PriorKind`; a test compares.
+# "auto", or the names of `train.plan.config.PriorKind`; a test compares them.
 Prior = Literal["auto", "off", "symmetry", "trained", "sd"]
 
-# The names of `commands.export.formats.FORMATS`; a test compares.
+# The names of `commands.export.formats.FORMATS`; a test compares them.
 Format = Literal[
     "ply",
     "spz",
@@ -50,7 +50,7 @@ Format = Literal[
 ]
 
 
-# Likewise of `commands.render.views`.
+# The names in `commands.render.views`; a test compares them.
 World = Literal["camera", "object"]
 About = Literal["object", "scene"]
 DepthFormat = Literal["png", "npy"]
@@ -221,7 +221,7 @@ def render(
 
     shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
     wanted = Wanted(out, video, depth, background_of(background))
-    # Shown on a terminal only: a line for each picture would be too many.
+    # On a terminal only: one line per picture would be too many elsewhere.
     with stderr.status("starting") as status:
         files = render_run(run, shot, wanted, status.update)
     rendered = sum(path.parent == out for path in files)

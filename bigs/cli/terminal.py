@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from bigs.bench.page import Table
     from bigs.train.plan.config import RunConfig
 
-# The names of `PRESETS` in `train.plan.presets`, spelled out: its import takes seconds; a test compares.
+# The names of `PRESETS` in `train.plan.presets`, whose import takes seconds; a test compares them.
 Preset = Literal["smoke", "demo", "fast", "full", "paper"]
 
-# A file or a pipe has no width; tables there are as wide as they need to be.
+# A file or a pipe has no width, so tables there are as wide as they need to be.
 _WIDTH_OF_A_FILE = 240
-# More of an error's text is no sentence.
+# Longest line of an error's text.
 _LONGEST_LINE = 1500
-# No machine has more processors; each thread takes memory.
+# More threads than any machine has processors; each takes memory.
 _MOST_THREADS = 4096
 
 
@@ -42,7 +42,7 @@ class _Output(Console):
     def on_broken_pipe(self) -> None:
         self.quiet = True
         stream = sys.stderr if self.stderr else sys.stdout
-        # What is still in the stream's buffer would else be tried once more as Python ends.
+        # Otherwise Python would try to write the stream's buffer once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -160,7 +160,7 @@ def print_table(rows: list[tuple[str, ...]]) -> None:
     table = Table(*heading)
     for index, column in enumerate(table.columns):
         column.overflow = "fold"
-        # Where it is narrow, headings and long sentences are folded, not numbers and names.
+        # On narrow terminals headings and long sentences are folded, numbers and names are not.
         column.min_width = min(24, max((len(row[index]) for row in body), default=0))
     for column in table.columns[1:]:
         column.justify = "right"

@@ -19,16 +19,16 @@ import tyro
 from bigs.checks import InputError, check_choice, expected_among, meant, nearest
 
 _HELP = ("--help", "-h")
-# Two dashes and a name, or one and a letter; numbers below zero are none.
+# Two dashes and a name, or one dash and a letter; negative numbers are no options.
 _OPTION = re.compile(r"--\w|-[A-Za-z]$")
 
 
 class Word(typing.NamedTuple):
     """What a command takes: an option, or a word in its place."""
 
-    name: str  # with its dashes, or as the help calls it
-    kind: Any  # its type, without what is said to the parser
-    most: float  # words that it takes at a time
+    name: str  # with its dashes, or as shown in the help
+    kind: Any  # its type without the parser's annotations
+    most: float  # number of words that it takes
     required: bool
 
     @property

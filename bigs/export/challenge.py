@@ -29,7 +29,7 @@ _DEEPEST = 4
 _GL_FROM_CV = np.array([1.0, -1.0, -1.0])
 # HOLD's scale is scene_bounding_sphere / (max_radius_ratio |n|), and these two are 6 and 3 by default.
 _SCENE_RADIUS = 2.0
-# Two float16 numbers of about a metre, subtracted, are this exact at best.
+# Best possible accuracy of the difference of two float16 numbers of about a metre.
 _HALF_TOLERANCE = 2e-3
 
 
@@ -322,7 +322,7 @@ def _check_roots(where: str, content: Mapping[str, Any]) -> None:
             continue
         expected = content[absolute].double() - content[root].double()[:, None]
         difference = (content[relative].double() - expected).abs().max().item() if expected.numel() else 0.0
-        # All three are rounded to float16, the root of a hand that is far off the coarsest.
+        # All three are rounded to float16; the root of a distant hand has the coarsest steps.
         size = max(content[key].abs().max().item() for key in (absolute, root)) if expected.numel() else 0.0
         if difference > _HALF_TOLERANCE * max(1.0, size):
             raise InputError(

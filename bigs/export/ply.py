@@ -20,7 +20,7 @@ from bigs.types import Gaussians
 
 # rgb = 0.5 + SH_C0 * f_dc, the constant real spherical harmonic
 SH_C0 = 0.28209479177387814
-# An opacity of exactly 0 or 1 has no finite logit, a scale of 0 no finite logarithm.
+# An opacity of exactly 0 or 1 has no finite logit; a scale of 0 has no finite logarithm.
 _OPACITY_MARGIN = 1e-6
 _MIN_SCALE = 1e-12
 
@@ -40,7 +40,7 @@ _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
 }
-# A header longer than this is no splat file's; the limit keeps a wrong file from being searched to its end.
+# No splat file has a longer header; the limit keeps a wrong file from being searched to its end.
 _MAX_HEADER = 64 * 1024
 
 

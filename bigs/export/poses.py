@@ -27,7 +27,7 @@ class HandPoses(NamedTuple):
     transl: np.ndarray  # [T, 3] metres
     betas: np.ndarray  # [10]
     grasp: np.ndarray  # [T] number of the grasp in which the object carries the hand, -1 for none
-    grasp_certainty: np.ndarray  # [T] in [0, 1] how sure that is
+    grasp_certainty: np.ndarray  # [T] in [0, 1], certainty of the grasp
 
 
 class ObjectPoses(NamedTuple):

@@ -47,7 +47,7 @@ def save_recording(
             f"{path}: expected the extra 'rerun' (pip install 'bigs[rerun]'), found no rerun"
         ) from error
     recording = rerun.RecordingStream("bigs", recording_id=name)
-    # The moment of writing says nothing about the clip.
+    # The time of writing says nothing about the clip.
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     memory = recording.memory_recording()

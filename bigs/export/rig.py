@@ -15,11 +15,11 @@ from bigs.geometry.mesh import vertex_normals
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.types import Side
 
-# Viewers read four bones a vertex.
+# Viewers read four bones per vertex.
 _BONES_PER_VERTEX = 4
-# Correctives are written as so many shapes that no vertex is farther off than this, metres.
+# Pose correctives are written with as many shapes as keep every vertex within this distance, metres.
 _SHAPE_TOLERANCE = 1e-4
-# A turn by half about x: from OpenCV's axes to glTF's, x y z w.
+# Half a turn about x: from OpenCV's axes to glTF's, x y z w.
 _HALF_TURN = [1.0, 0.0, 0.0, 0.0]
 
 
@@ -104,7 +104,7 @@ def save_rig(
         roots.append(_add_skin(document, track, name, hand, joints, material))
     if obj is not None:
         children.append(_add_object(document, track, obj, material))
-    # A skinned mesh goes where its joints go, whatever its own node says, so it stays outside.
+    # A skinned mesh follows its joints whatever its node says, so it stays outside.
     turned = document.add("nodes", name="clip", rotation=_HALF_TURN, children=children)
     lens = {"yfov": float(2.0 * np.arctan(0.5 * height / K[1, 1])), "znear": 0.01}
     camera = document.add("cameras", type="perspective", perspective=lens | {"aspectRatio": width / height})

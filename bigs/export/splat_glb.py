@@ -63,7 +63,7 @@ def opengl_axes(gaussians: Gaussians) -> Gaussians:
     """Gaussians given in OpenCV's axes, in those with y up and z towards the viewer; unit quaternions."""
     half_turn_about_x = gaussians.quats.new_tensor([0.0, 1.0, 0.0, 0.0])
     quats = quat_multiply(half_turn_about_x.expand_as(gaussians.quats), gaussians.quats)
-    # A zero quaternion is no rotation.
+    # The zero quaternion stands for no rotation.
     still = quats.new_tensor([0.0, 1.0, 0.0, 0.0])
     length = quats.norm(dim=-1, keepdim=True)
     quats = torch.where(length > 0, quats / length.clamp_min(1e-30), still)

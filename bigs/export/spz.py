@@ -12,7 +12,7 @@ from bigs.export.ply import check_splats, stored_form
 from bigs.export.splat_glb import opengl_axes
 from bigs.types import Gaussians
 
-# Positions are 24-bit fixed-point numbers; the finest step that still reaches the farthest one is taken.
+# Positions are 24-bit fixed-point numbers, with the finest step that still reaches the farthest one.
 _POSITION_BITS = 23
 _FINEST_STEP_BITS = 20
 

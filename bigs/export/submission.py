@@ -146,7 +146,7 @@ class _HoldDictionary(dict[str, Any]):
     """Stands for `common.xdict.xdict` while a file is written."""
 
 
-# The pickler in Python, whose way of writing a class's name can be changed.
+# The Python pickler: its way of writing a class's name can be changed.
 _PythonPickler: Any = getattr(pickle, "_Pickler")  # noqa: B009
 
 
@@ -160,7 +160,7 @@ class _HoldPickler(_PythonPickler):
         else:
             super().save_type(obj)
 
-    # Pickle looks its methods up by the type of what it writes.
+    # Pickle looks up its methods by type.
     dispatch = _PythonPickler.dispatch | {type: save_type}
 
 

@@ -13,14 +13,14 @@ from trimesh.registration import icp
 from bigs.checks import check_shape
 from bigs.metrics.shape import MAX_POINTS, Chamfer, ShapeScore, chamfer, draw, shape_score
 
-# As many surface samples as the published evaluator aligns with.
+# As many surface samples as in the published evaluator's alignment.
 _COARSE_POINTS = 1000
 _COARSE_ITERATIONS = 40
-# The best few starts are finished on (nearly) all vertices.
+# The best starts are refined on (nearly) all vertices.
 _FINE_STARTS = 10
 _FINE_POINTS = 20_000
 _FINE_ITERATIONS = 100
-# Shapes are brought to unit radius first, so this is a relative mean squared error.
+# Shapes are scaled to unit radius first, so this is a relative mean squared error.
 _TOLERANCE = 1e-7
 
 _UNSCORED = ShapeScore(Chamfer(np.inf, np.inf), 0.0, 0.0)

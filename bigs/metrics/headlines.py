@@ -12,7 +12,7 @@ from bigs.metrics.report import comparison_table
 class Headline(NamedTuple):
     """A score that is shown first."""
 
-    keys: tuple[str, ...]  # the first that a run has is shown
+    keys: tuple[str, ...]  # the first key that a run has is shown
     means: str
 
 

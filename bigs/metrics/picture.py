@@ -29,15 +29,14 @@ PICTURE_METRICS: dict[str, Metric] = {
     "lpips_foreground": Metric("LPIPS of the foreground", "", "lower"),
     "lpips_full": Metric("LPIPS, whole frame", "", "lower", detail=True),
 }
-# The same of views that the reconstruction never saw: as it is, and after the one scale per clip that one
-# camera cannot see.
+# The same for held-out views: as they are, and after the one scale per clip that a single camera cannot see.
 NOVEL, NOVEL_SCALED = "novel_", "novel_scaled_"
 PICTURE_METRICS |= {
     f"{prefix}{key}": Metric(f"{metric.paper}, {views}", metric.unit, metric.better, metric.detail)
     for prefix, views in ((NOVEL, "novel views"), (NOVEL_SCALED, "novel views, one scale for the clip"))
     for key, metric in PICTURE_METRICS.items()
 }
-# Half a centimetre of depth moves print by a few pixels in a turned view and hides every other fault there.
+# Half a centimetre of depth moves texture by a few pixels in a turned view and hides every other fault.
 ALIGNED = "psnr_aligned"
 PICTURE_METRICS |= {
     f"{prefix}{ALIGNED}": Metric(f"PSNR of each subject where it fits best, {views}", "dB", "higher")

@@ -21,7 +21,7 @@ class Metric(NamedTuple):
     paper: str  # its name in the paper's tables, or a plain description where the paper has none
     unit: str
     better: Literal["lower", "higher", "neither"]
-    detail: bool = False  # for a whole report; short tables do without it
+    detail: bool = False  # shown in a full report only
 
 
 # In the order in which they are printed. The paper labels CD_r, CD_l and CD_o cm², so the squared form
@@ -61,7 +61,7 @@ METRICS: dict[str, Metric] = {
     "mrrpe_r": Metric("MRRPE, right wrist to object", "mm", "lower", detail=True),
     "mrrpe_l": Metric("MRRPE, left wrist to object", "mm", "lower", detail=True),
 }
-# Ends of the keys that are scores of a single frame.
+# Suffixes of scores of a single frame.
 _OF_ONE_FRAME = ("_icp", "_icp_sq", "_icp_arctic")
 
 
@@ -101,7 +101,7 @@ def remarks(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, s
             absent[name] = f"the {'result has no' if ours is None else 'truth has no'} {name}"
     for key in METRICS:
         needed = _parts_of(key)
-        # A score about something that neither side has is no loss.
+        # A score of something that neither side has is not missing.
         if not needed or not all(name in known or name in absent for name in needed):
             continue
         reason = next((absent[name] for name in needed if name in absent), "")

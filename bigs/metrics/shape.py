@@ -12,7 +12,7 @@ from bigs.checks import InputError, check_shape
 
 # The evaluators draw this many vertices of each set in every frame (vertices, not surface samples).
 POINTS_PER_FRAME = 3000
-# Whole vertex sets are scored after alignment; sets beyond this are thinned, which moves no score noticeably.
+# Whole vertex sets are scored after alignment; larger sets are thinned, which changes no score noticeably.
 MAX_POINTS = 100_000
 _CM = 100.0
 
@@ -128,5 +128,5 @@ def _chamfer(p_to_g: np.ndarray, g_to_p: np.ndarray) -> Chamfer:
 def _f_score(p_to_g: np.ndarray, g_to_p: np.ndarray, threshold_mm: float) -> float:
     threshold_cm = threshold_mm / 10.0
     precision, recall = np.mean(p_to_g < threshold_cm), np.mean(g_to_p < threshold_cm)
-    # the small term is the evaluators' own: no match at all is a score of 0
+    # the small term is the evaluators': without any match the score is 0
     return float(100.0 * 2.0 * precision * recall / (precision + recall + 1e-7))

@@ -135,7 +135,7 @@ def rasterization(
                 rust.Extras(means2d, absgrad, median_depth),
             )
         except ValueError as error:
-            # The engine numbers elements of its own flat arrays; say it in the caller's shapes.
+            # The engine's message counts in its flat arrays; report the caller's shapes.
             check_cameras(viewmats, Ks)
             for name, tensor in tensors.items():
                 check_finite(name, tensor)

@@ -11,18 +11,18 @@ import torch
 
 from bigs.checks import InputError, check_finite
 
-# A rotation part whose volume is this small a part of the product of its rows' lengths is singular.
+# A rotation part is singular if its volume is less than this part of the product of its rows' lengths.
 _SINGULAR = 1e-9
-# Of all images of a call: 8 GB in single precision. Axes that only repeat can announce any number.
+# Limit over all images of a call, 8 GB in single precision: broadcast axes can announce any number.
 _MAX_VALUES = 1 << 31
-# What follows from shapes alone is worked out once for each of so many: in a loop they come again and again.
+# Size of the cache of what follows from shapes alone; a loop repeats the same shapes.
 _REMEMBERED = 64
 
-# Of each input that is there its name and shape.
+# Name and shape of each given input.
 Shapes = tuple[tuple[str, tuple[int, ...]], ...]
 
-# The engine's order of inputs, how many axes are each one's own, and whether the camera's comes before them;
-# that of colours depends.
+# The engine's order of inputs, with the number of own axes and whether camera axes come before them; colours
+# vary.
 _AXES = {
     "means": (2, False),
     "quats": (2, False),
@@ -103,7 +103,7 @@ def batch_of(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> 
 @lru_cache(_REMEMBERED)
 def _fitted(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> Batch:
     found = {name: tuple(shape) for name, shape in shapes}
-    # A tensor with too few axes to tell a size fails its own check below, whatever this says.
+    # A tensor with too few axes to tell a size fails its own check below.
     n = found["means"][-2] if len(found["means"]) >= 2 else 1
     cameras = found["viewmats"][-3] if len(found["viewmats"]) >= 3 else 1
     channels = found["colors"][-1] if len(found["colors"]) >= 2 else 1
@@ -141,7 +141,7 @@ def _fitted(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> B
     if 0 in batch:
         raise InputError(f"batch axes: expected at least one entry, found {list(batch)}")
     images = math.prod(batch) * cameras
-    # Each pixel has its colours, alpha and depth, each Gaussian in each image a place, depth and extent.
+    # Each pixel has colours, alpha and depth; each Gaussian in each image has a place, depth and extent.
     for name, each in (("width and height", width * height * (channels + 2)), ("means", 5 * n)):
         if images * each > _MAX_VALUES:
             raise InputError(
@@ -173,7 +173,7 @@ def slabs_of(shapes: Shapes, batch: Batch) -> Slabs:
 
 def _broadcast(leading: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
     different = {axes for axes in leading.values() if axes}
-    if len(different) <= 1:  # the usual case; torch takes longer to say so
+    if len(different) <= 1:  # the usual case, which torch takes longer to find
         return different.pop() if different else ()
     try:
         return tuple(torch.broadcast_shapes(*leading.values()))
@@ -192,7 +192,7 @@ def check_cameras(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:
     check_finite("Ks", Ks)
     views, matrices = (x.detach().cpu().numpy().astype(np.float64) for x in (viewmats, Ks))
     rotations = views[..., :3, :3]
-    # In units of each row's largest entry, so that no product leaves the range of numbers.
+    # In units of each row's largest entry, so that no product overflows.
     rotations = rotations / np.abs(rotations).max(-1, keepdims=True).clip(min=np.finfo(np.float32).tiny)
     volume = np.prod(np.linalg.norm(rotations, axis=-1), axis=-1)
     problems = (

@@ -12,7 +12,7 @@ import torch
 from bigs.checks import InputError
 from bigs.raster.settings import RasterSettings
 
-# gsplat has these as constants of its kernels.
+# Constants of gsplat's kernels.
 _FIXED = ("alpha_threshold", "max_alpha", "min_transmittance", "exp_degree")
 
 

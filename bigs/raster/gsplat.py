@@ -19,7 +19,7 @@ from bigs.raster.sh import spherical_harmonics
 
 __all__ = ["rasterization", "spherical_harmonics"]
 
-# Why what is not here is not.
+# Why these arguments are refused.
 _WHY = {
     "sparse_grad": "gradients are dense",
     "distributed": "one process renders everything",

@@ -55,7 +55,7 @@ def rasterize_view(
     image, transmittance, medians = _composite(screen, torch.cat(channels, dim=-1), width, height, settings)
     if pixel_mask is not None:
         medians = torch.where(pixel_mask.reshape(-1), medians, -1)
-    of_none = torch.tensor([-1], device=medians.device)  # what the index −1 picks
+    of_none = torch.tensor([-1], device=medians.device)  # selected by index −1
     info["median_ids"] = torch.cat([screen.ids, of_none])[medians].reshape(height, width).int()
     depths = torch.cat([screen.depths, screen.depths.new_zeros(1)])[medians]
     info["render_median"] = depths.reshape(height, width, 1)
@@ -66,7 +66,7 @@ def rasterize_view(
     alphas = 1 - transmittance[:, None]
     image = image + transmittance[:, None] * behind
     if render_mode.endswith("ED"):
-        # gsplat divides so where there is hardly any alpha
+        # gsplat's rule for pixels with hardly any alpha
         expected = image[:, -1:] / alphas.clamp(min=1e-10)
         image = torch.cat([image[:, :-1], expected], dim=-1)
     if pixel_mask is not None:
@@ -98,7 +98,7 @@ def _pinhole(
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
-    # The slopes in the Jacobian stay within 1.3 × half the field of view, measured from the image border.
+    # Slopes in the Jacobian are clamped to 1.3 × half the field of view, measured from the image border.
     margin_x, margin_y = 0.15 * width, 0.15 * height
     slope_x = (x / z).clamp(min=-(cx + margin_x) / fx, max=(width - cx + margin_x) / fx)
     slope_y = (y / z).clamp(min=-(cy + margin_y) / fy, max=(height - cy + margin_y) / fy)
@@ -170,7 +170,7 @@ def _project(
     info["depths"][ids[order]] = z[order].detach()
     info["radii"][ids[order]] = radii[order].detach().ceil().clamp(max=2.0**31 - 128).int()
     order = order[torch.argsort(z[order], stable=True)]
-    # From info, so that a caller can ask for the gradient of the centres.
+    # Taken from info, so that callers can ask for the gradient of the centres.
     return _Screen(
         info["means2d"][ids[order]], covs2d[order], z[order], visible_opacities[order], ids[order]
     ), info

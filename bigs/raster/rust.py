@@ -18,7 +18,7 @@ from bigs.raster.settings import RasterSettings
 Inputs = tuple[torch.Tensor | None, ...]
 DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 
-# Whether info's means2d are mere values or a tensor of the graph: of all Gaussians, or of those seen.
+# Whether info's means2d are plain values, or a tensor in the graph: of all Gaussians, or of the visible ones.
 Means2d = Literal["values", "full", "packed"]
 
 
@@ -64,9 +64,9 @@ class _Rasterize(torch.autograd.Function):
         means2d: torch.Tensor | None,
         *inputs: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        # Saved to notice inputs changed in place before the backward pass; what it reads are the arrays.
+        # Saved so that torch notices inputs changed in place; the backward pass reads the arrays.
         ctx.save_for_backward(means2d, *inputs)
-        # Of the inputs it needs the Gaussians; the state knows the rest.
+        # The backward pass needs the Gaussians again; the state holds the rest.
         ctx.arrays, ctx.counts, ctx.state = arrays[:5], call.counts[:5], state
         ctx.info, ctx.absgrad = info, absgrad
         ctx.set_materialize_grads(False)
@@ -95,7 +95,7 @@ class _Rasterize(torch.autograd.Function):
         )
         if ctx.absgrad and want_means2d:
             full, shown = torch.from_numpy(absolute).view(means2d.shape), ctx.info["means2d"]
-            # As gsplat leaves it: an attribute, in the layout that the caller sees.
+            # An attribute in the caller's layout, as gsplat does it.
             shown.absgrad = full if shown.shape == full.shape else full[ctx.info["depths"] > 0]
         return (
             *[None] * 6,
@@ -111,9 +111,9 @@ def _gradient_of(tensor: torch.Tensor | None, wanted: bool, gradient: np.ndarray
     if tensor is None or not wanted:
         return None
     if gradient.size == tensor.numel():
-        # Shaped by numpy, which takes less time for it than torch.
+        # numpy reshapes faster than torch.
         return torch.from_numpy(gradient.reshape(tensor.shape))
-    # Of a world-to-camera matrix the engine returns three rows; the last is constant.
+    # The engine returns three rows of a world-to-camera matrix; the last is constant.
     rows = torch.from_numpy(gradient.reshape(*tensor.shape[:-2], 3, 4))
     return torch.cat([rows, torch.zeros_like(rows[..., :1, :])], dim=-2)
 

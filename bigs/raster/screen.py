@@ -70,7 +70,7 @@ class _Centres(torch.autograd.Function):
             points = points.expand(*seen.shape, 3)[seen]
             focal = torch.diagonal(Ks[..., :2, :2], dim1=-2, dim2=-1)[..., None, :]
             focal = focal.expand(*seen.shape, 2)[seen]
-            # The principal point moves nothing.
+            # The principal point has no effect here.
             centres = focal * points[:, :2]
             if ctx.camera_model == "pinhole":
                 centres = centres / points[:, 2:]

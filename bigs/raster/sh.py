@@ -15,7 +15,7 @@ from bigs.raster import reference
 
 DEGREES = (0, 1, 2, 3)
 
-# (degree, dirs, coeffs) to colours, as `spherical_harmonics`.
+# (degree, dirs, coeffs) to colours, like `spherical_harmonics`.
 Evaluate = Callable[[int, torch.Tensor, torch.Tensor], torch.Tensor]
 
 

@@ -17,13 +17,11 @@ from bigs.checks import InputError
 from bigs.viewer.origins import own_pages_only
 from bigs.viewer.stage import Mesh, Splats, Stage
 
-# The page's renderer keeps covariances as 16-bit floats: in metres a millimetre squared would be lost, in
-# centimetres it is not.
+# The page stores covariances as 16-bit floats: square millimetres vanish in metres but not in centimetres.
 _UNITS_PER_METRE = 100.0
 _TRUTH_COLOR = (40, 190, 90)
 _FRUSTUM_DEPTH = 4.0  # centimetres
-# Where the page's camera starts: beside and behind the clip's own and looking a little in front of the scene,
-# so that both scene and frustum are in sight.
+# The page's camera starts beside and behind the clip's own, so that scene and frustum are in sight.
 _START_TURN, _START_DISTANCE, _START_PULL, _START_FOV = 15.0, 1.4, 0.15, 50.0
 _LAST_PORT = 65535
 _AS_RECONSTRUCTED, _BY_SUBJECT = "as reconstructed", "by subject"
@@ -47,7 +45,7 @@ class Viewer:
                 "live viewer: expected the extra 'viewer' (pip install 'bigs[viewer]'), found no viser"
             ) from error
         _check_address(host, port)
-        # It would print a box with its address.
+        # viser would print a box with its address.
         with contextlib.redirect_stdout(io.StringIO()), own_pages_only(host):
             self._server = viser.ViserServer(host=host, port=port, label=stage.title, verbose=False)
         self._stage = stage
@@ -85,8 +83,8 @@ class Viewer:
 
     def wait(self) -> None:
         """Serve until interrupted, or until drawing fails, which is then raised here."""
-        # Not join: before Python 3.13 an interrupted join takes the thread for ended, and an interpreter that
-        # then ends while the thread still draws aborts.
+        # Not join: before Python 3.13 an interrupted join marks the thread as ended, and the interpreter
+        # aborts if it exits while the thread still draws.
         self._ended.wait()
         if self._failure is not None:
             raise self._failure
@@ -176,7 +174,7 @@ class Viewer:
             if self._playing is not None and self._playing.value:
                 due = max(due + 1.0 / self._fps.value, time.monotonic())
                 self._closing.wait(due - time.monotonic())
-                # A frame that someone chose meanwhile counts; otherwise the next one.
+                # If the user chose a frame meanwhile, keep it.
                 chosen = self._frame.value
                 self._frame.value = (chosen + 1) % self._stage.frames
             else:

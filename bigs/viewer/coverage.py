@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-# A patch of surface counts as seen from directions within this angle of its normal; beyond, it is too slanted
-# to be reconstructed.
+# Surface counts as seen from directions within this angle of its normal; beyond, it is too slanted to
+# reconstruct.
 _WIDEST = 60.0
 _RADIUS, _MARGIN, _CAPTION = 150, 14, 22
 _PAPER, _INK, _UNSEEN, _CAMERA = (255, 255, 255), (20, 20, 20), (214, 96, 77), (20, 20, 20)
-# From seen once to seen most often.
+# Colours from seen once to seen most often.
 _FEW, _MANY = np.array([222.0, 235.0, 247.0]), np.array([8.0, 81.0, 156.0])
 
 
@@ -53,7 +53,7 @@ def coverage_map(directions: np.ndarray, visible: np.ndarray) -> Coverage:
             draw.ellipse((at[0] - 2, at[1] - 2, at[0] + 2, at[1] + 2), _CAMERA)
         name = f"facing {'+' if sign > 0 else '-'}z of the object"
         draw.text((left + _RADIUS, top + 2 * _RADIUS + _CAPTION / 2), name, _INK, font, anchor="mm")
-    # In an equal-area projection pixels count alike.
+    # In an equal-area projection all pixels weigh the same.
     return Coverage(float(np.concatenate(seen).mean()), picture)
 
 
@@ -62,7 +62,7 @@ def _half_sphere(sign: float) -> tuple[np.ndarray, np.ndarray]:
     at = (np.arange(2 * _RADIUS) + 0.5) / _RADIUS - 1.0
     x, y = np.meshgrid(at, -at)
     square = x * x + y * y
-    # Lambert: the radius goes to sqrt(1 - |z|), which reaches 1 at the equator.
+    # Lambert's projection: the radius is sqrt(1 - |z|), which reaches 1 at the equator.
     z = 1.0 - square
     stretch = np.sqrt(np.maximum(2.0 - square, 0.0))
     return np.stack([sign * x * stretch, y * stretch, sign * z], axis=-1), square <= 1.0

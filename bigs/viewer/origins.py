@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-# The library's function is replaced for a moment; two viewers that start at once take turns.
+# The library's function is replaced for a moment, so viewers start one at a time.
 _STARTING = threading.Lock()
 
 

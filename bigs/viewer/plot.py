@@ -8,9 +8,9 @@ from html import escape
 
 _WIDTH, _HEIGHT = 360, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 8, 24, 26
-# A curve over more points than this shows no more on that width.
+# More points are not visible at this width.
 _MAX_POINTS = 400
-# Beyond this ratio a linear axis hides the end of a loss curve.
+# Beyond this ratio a linear axis would hide the end of a loss curve.
 _LOG_RATIO = 20.0
 
 

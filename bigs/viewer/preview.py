@@ -13,14 +13,14 @@ from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_shape
 
 _GAP = 4
-# A cell is at most so many times as high as wide: a sheet of narrow pictures is a picture, not a ribbon.
+# A cell is at most this many times as high as wide.
 _HIGHEST_CELL = 3
-# The encoder's limit for a side is 16384; larger frames are made smaller.
+# The encoder's limit for a side is 16384; larger frames are shrunk.
 _VIDEO_SIDE = 8192
 _FONT_SIZE = 14
 _CAPTION_HEIGHT = 22
 _PAPER, _INK, _EMPTY = (255, 255, 255), (20, 20, 20), (236, 236, 236)
-# 420 is what every player decodes; quality 20 leaves no visible blocks at these sizes.
+# Every player decodes 4:2:0; quality 20 leaves no visible blocks at these sizes.
 _PIXEL_FORMAT, _QUALITY = "yuv420p", "20"
 
 

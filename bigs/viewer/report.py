@@ -18,14 +18,14 @@ from bigs.checks import InputError
 from bigs.viewer.plot import line_plot
 
 _JPEG_QUALITY = 88
-# The format's limit for a side.
+# JPEG's limit for a side.
 _JPEG_SIDE = 65500
-# Of the pictures under the slider, of which there are many.
+# JPEG quality of the pictures under the slider, of which there are many.
 _FRAME_QUALITY = 75
-# Keys of a log row that say where it belongs and are no curves themselves.
+# Keys of a log row that locate it and are not curves.
 _POSITION_KEYS = ("stage", "step", "steps", "time")
 
-# Between them stand the scores, which may come later.
+# The scores between these marks may be replaced later.
 _SCORES = ("<!-- scores -->", "<!-- end of scores -->")
 
 _STYLE = """
@@ -110,7 +110,7 @@ def write_report(
         if not Path(video).is_file():
             raise InputError(f"{video}: expected a video for the report, found no such file")
         source = _embedded(Path(video).read_bytes(), "video/mp4")
-        # Browsers may leave the place of a video empty until it is played.
+        # Browsers may show nothing before a video plays.
         first = _embedded(_jpeg(frames[0][1], _FRAME_QUALITY), "image/jpeg") if frames else ""
         poster = f' poster="{first}"' if first else ""
         parts.append(f'<h2>Video</h2><video controls loop muted{poster} src="{source}"></video>')

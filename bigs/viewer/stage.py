@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-# (subject, knob) -> degrees; a knob that is not named rests at 0.
+# (subject, knob) -> degrees; missing knobs are 0.
 Pose = Mapping[tuple[str, str], float]
 
 
@@ -45,10 +45,10 @@ class Stage:
     width: int
     height: int
     middle: np.ndarray  # [3] what to look at, metres
-    colors: Mapping[str, tuple[int, int, int]]  # every subject and the colour that stands for it
+    colors: Mapping[str, tuple[int, int, int]]  # every subject and its colour
     show: Callable[[int, Pose], Mapping[str, Subject]]  # frame, pose -> every subject
     knobs: Mapping[str, Mapping[str, tuple[int, int]]] = field(default_factory=dict)  # degrees from, to
     image: Callable[[int], np.ndarray] | None = None  # frame -> [H, W, 3] uint8
-    truth: Callable[[int], Mapping[str, Mesh]] | None = None  # frame -> every true subject
+    truth: Callable[[int], Mapping[str, Mesh]] | None = None  # frame -> ground truth of every subject
     grasps: str = ""  # when hands hold the object, an SVG element
     fps: float = 30.0
