@@ -31,11 +31,11 @@ from bigs.unpickle import load_npy
 DEFAULT_VIEW = 1
 MM_PER_M = 1000.0
 _IMAGE_FOLDERS = ("images", "cropped_images")
-# What the data set's own processing makes of a sequence lies in one of these, from ROOT: it has the boxes.
+# ARCTIC's own processing writes a sequence into one of these folders below ROOT; it has the boxes.
 _PROCESSED_FOLDERS = ("processed/seqs", "processed_verts/seqs")
-# A cropped image shows so many times the box, whose side is its scale times so many pixels.
+# A cropped image shows this many times the box, whose side is its scale times this many pixels.
 _CROP_FACTOR, _BOX_PIXELS = 1.5, 200.0
-# Ours: label masks may lie here, in the same tree as the images.
+# Our addition: label masks may lie here, in the same tree as the images.
 _MASK_FOLDER = "masks"
 
 
@@ -263,9 +263,9 @@ def _optics(view: ArcticView, annotation: Annotation, image_paths: Sequence[Path
     is_cropped = image_paths[0].is_relative_to(view.root / "cropped_images")
     boxes = np.repeat([[0.0, 0.0, *map(float, size)]], len(image_paths), axis=0)
     if not is_cropped or (width, height) == size:
-        # A picture of another size than annotated is refused where it is read.
+        # An image of another size is refused when it is read.
         return Optics(annotation.K, size, size, boxes, distortion) if distortion.any() else None
-    if view.view:  # those of view 0 are whole and only smaller
+    if view.view:  # those of view 0 are whole images at a smaller size
         boxes = _crop_boxes(view, [path.name for path in image_paths])
     return Optics(annotation.K, size, (width, height), boxes, distortion)
 
@@ -293,7 +293,7 @@ def _read_hand(where: str, stored: Any, n_rows: int, rows: np.ndarray, valid: np
     def field(key: str, shape: tuple[int, ...]) -> np.ndarray:
         return array_field(f"{where}.{key}", require(f"{where}.{key}", stored, key), shape)
 
-    # One shape for all; the documentation shows it repeated in every frame.
+    # One shape for all frames; the documentation shows it repeated in every frame.
     shapes = flat_field(f"{where}.shape", require(f"{where}.shape", stored, "shape"))
     betas = field("shape", (n_rows, 10))[0] if len(shapes) != 10 else shapes
     return HandTrack(
@@ -311,7 +311,7 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     if not folder.is_dir():
         return None
     verts, faces = read_mesh(folder / "mesh.obj")
-    # Longer than 2 mm and shorter than 2 m: the template's unit can be told.
+    # Objects are between 2 mm and 2 m long, so the size tells the template's unit.
     if np.ptp(verts, axis=0).max() > LONGEST_M:
         verts = verts / MM_PER_M
     check_solid(str(folder / "mesh.obj"), verts, faces)
@@ -322,7 +322,7 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     angles = poses[:, 0]
     if angles.any():
         is_top = _top_vertices(folder, len(verts))
-        # The lid turns about the template's -z, before the whole moves.
+        # The lid turns about the template's -z, before the whole object moves.
         turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 0.0, -1.0])).as_matrix()
         bent = np.repeat(verts[None], len(rows), axis=0)
         bent[:, is_top] = np.einsum("tij,nj->tni", turns, verts[is_top])

@@ -60,7 +60,7 @@ class Clip:
     folder: Path  # where image/, mask/ and data.npy lie
     frame_names: tuple[str, ...]  # T original names
     image_paths: tuple[Path, ...]
-    mask_paths: tuple[Path, ...]  # none at all for a dataset's sequence without masks
+    mask_paths: tuple[Path, ...]  # empty for a data set's sequence without masks
     width: int
     height: int
     K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
@@ -71,10 +71,12 @@ class Clip:
     normalize_shift: (
         np.ndarray
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
-    mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files; all have a key
-    annotated: bool = False  # the tracks are a dataset's truth, which no reconstruction may start from
-    optics: Optics | None = None  # how the files differ from the pictures, where they do
-    notes: tuple[str, ...] = ()  # what of the estimates was odd, or was taken out (see `plausible`)
+    mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files, for every entity
+    annotated: bool = (
+        False  # whether the tracks are a data set's ground truth, from which no reconstruction may start
+    )
+    optics: Optics | None = None  # how the files differ from pinhole images, if they do
+    notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:
         check_name(f"{self.folder}: name", self.name)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 from bigs.checks import InputError
 from bigs.files import check_regular, read_bytes
 
-# Parameters of the camera models, by number, as COLMAP's documentation lists them.
+# Parameters of each camera model, by number, from COLMAP's documentation.
 _PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
 # A model of a thousand frames has 30 MB.
 _MAX_BYTES = 1 << 30
-# Longer names no file system has.
+# No file system has longer names.
 _LONGEST_NAME = 4096
 
 
@@ -52,7 +52,7 @@ class _Reader(NamedTuple):
 
     def rig(self, at: int) -> int:
         sensors, at = self.number(at + 4, "I"), at + 8
-        # The first is the one that the others' poses refer to; each of them may have a pose.
+        # The first camera is the one that the others' poses refer to; each of the others may have a pose.
         for index in range(sensors):
             at += 8 if index == 0 else 9 + 56 * bool(self.number(at + 8, "B"))
         return at

@@ -14,7 +14,8 @@ import torch
 
 from bigs.checks import InputError, check_finite, check_shape, shown
 
-# Metres, pixels, radians, counts: no honest number is larger, and squares of larger ones leave float32.
+# In metres, pixels, radians and counts no plausible number is larger, and squares of larger ones overflow
+# float32.
 LARGEST = 1e15
 
 
@@ -65,7 +66,7 @@ def _numbers(where: str, value: Any) -> np.ndarray:
         ) from None
     if array.dtype.kind not in "fiub":
         raise InputError(f"{where}: expected an array of numbers, found {_kind(value, array)}")
-    with np.errstate(over="ignore"):  # of wider floats, which then are infinite
+    with np.errstate(over="ignore"):  # wider floats become infinite
         array = array.astype(np.float64)
     largest = np.abs(array[np.isfinite(array)]).max(initial=0.0)
     if largest > LARGEST:

@@ -24,7 +24,7 @@ from bigs.names import check_name
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
 OBJECT_FILE = "gt_object.ply"
-# A fist of a child, and a spread hand of the tallest man ever measured, with room to spare.
+# From a child's fist to the largest spread hand, with a margin.
 SHORTEST_HAND_M, LONGEST_HAND_M = 0.02, 0.6
 
 

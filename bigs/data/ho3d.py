@@ -28,13 +28,13 @@ from bigs.unpickle import restricted_load
 
 SPLITS = ("train", "evaluation")
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
-# Of every frame of the data set.
+# Numbers in every frame of the data set.
 _SIZE = (640, 480)
-# Where the YCB models may lie, from the release's folder.
+# Folders of the YCB models, relative to the release's folder.
 _MODEL_FOLDERS = ("models", "YCB_Video_Models/models", "../models", "../YCB_Video_Models/models")
-# Ours: label masks may lie here, beside rgb/.
+# Our addition: label masks may lie here, beside rgb/.
 _MASK_FOLDER = "mask"
-# Parts of a clip that a path may name instead of the clip.
+# Subfolders that a path may name instead of the clip.
 _PARTS = ("rgb", "meta", "depth")
 
 
@@ -165,7 +165,7 @@ def _read_hand(
         global_orient=poses[:, 0],
         hand_pose=poses[:, 1:] - hands_mean,
         transl=fill_vectors(_column(files, metas, "handTrans", 3, valid), valid),
-        # One person holds one object in a clip, so its frames repeat one shape.
+        # One person holds one object in a clip, so its frames share one shape.
         betas=np.median(betas, axis=0),
         valid=valid,
     )

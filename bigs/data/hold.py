@@ -36,7 +36,7 @@ from bigs.unpickle import load_npy
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 
-# HOLD's defaults; together they make the scaled space's unit half the camera's distance from the origin.
+# HOLD's defaults: with them the scaled space's unit is half the camera's distance from the origin.
 SCENE_BOUNDING_SPHERE = 6.0
 MAX_RADIUS_RATIO = 3.0
 RADIUS_PER_SHIFT = MAX_RADIUS_RATIO / SCENE_BOUNDING_SPHERE

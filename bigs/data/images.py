@@ -19,7 +19,7 @@ from bigs.types import ENTITIES, MASK_VALUES, Entity
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MASK_SUFFIXES = (".png",)
 
-# What Pillow raises for files that are not images, are cut short, or unpack to an absurd size.
+# What Pillow raises for files that are no images, are truncated, or unpack to an absurd size.
 UNREADABLE = (
     OSError,
     SyntaxError,
@@ -27,12 +27,12 @@ UNREADABLE = (
     Image.DecompressionBombError,
     Image.DecompressionBombWarning,
 )
-# Pillow opens any format by its content, and hands some to other programs; these it decodes itself.
+# Pillow detects formats by content and delegates some to other programs; it decodes these itself.
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 _FRAME_FORMATS = ("PNG", "JPEG")
-# A picture of `MAX_PIXELS` in 16 bits of four colours, stored as it is.
+# Bytes of a picture of `MAX_PIXELS` with four 16-bit channels, uncompressed.
 _MAX_PICTURE_BYTES = 1 << 29
-# It warns first and refuses at twice the size; a warning is a second line beside our sentence.
+# Pillow first warns and refuses at twice the size; a warning would be a second line beside the error.
 warnings.filterwarnings("error", category=Image.DecompressionBombWarning)
 
 

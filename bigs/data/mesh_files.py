@@ -22,14 +22,14 @@ MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 # A scan of two million triangles has 100 MB.
 _MAX_BYTES = 256 * MIB
 _MAX_HEADER_BYTES, _MAX_PROPERTIES = 1 << 16, 1000
-# Every material and group of an OBJ is a mesh of its own, made by a look at all vertices.
+# trimesh makes a mesh of every material and group of an OBJ, each by a pass over all vertices.
 _MAX_PARTS = 1000
-# Corners and vertices that a scene has once each use of a mesh is written out.
+# Limit of corners and vertices of a scene once each use of a mesh is written out.
 _MAX_VALUES = 20_000_000
-# What lies beside a mesh: materials and pictures.
+# Files beside a mesh: materials and textures.
 _MAX_BESIDE, _MAX_BESIDE_BYTES = 64, 128 * MIB
 _GLB_JSON = 0x4E4F534A
-# Of an OBJ: vertices and faces. A face's corner names texture coordinates and normals, too, after a slash.
+# Vertices and faces of an OBJ. A face's corner also names texture coordinates and normals after a slash.
 _OBJ_LINES = re.compile(rb"^[ \t]*([vf][ \t].*)$", re.MULTILINE)
 _OBJ_PARTS = re.compile(rb"^[ \t]*(?:usemtl|mtllib|[go])\b", re.MULTILINE)
 
@@ -62,11 +62,11 @@ def load_mesh_file(file: Path, what: str, load: Callable[..., Any], *, materials
             file_type=kind[1:],
             resolver=_Beside(file.parent),
             process=False,
-            # With textures a vertex on a seam has to become several.
+            # With textures, a vertex on a seam becomes several.
             maintain_order=not materials,
             skip_materials=not materials,
         )
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
+    except Exception as error:  # trimesh's readers raise many kinds of errors
         raise InputError(
             f"{file}: expected {what}, found {shown(str(error)) if str(error) else type(error).__name__}"
         ) from None

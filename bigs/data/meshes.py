@@ -10,11 +10,11 @@ import trimesh
 from bigs.checks import InputError, check_faces, check_finite
 from bigs.data.mesh_files import load_mesh_file
 
-# What two hands hold is longer than 2 mm and shorter than 2 m.
+# Objects for two hands are between 2 mm and 2 m long.
 SHORTEST_M, LONGEST_M = 0.002, 2.0
-# A sheet of paper is flatter than anything to be held: 0.1 mm to 300 mm.
+# A sheet of paper is the flattest: 0.1 mm to 300 mm.
 _LEAST_DEPTH = 1e-4
-# Surface over the square of the length: 0.06 for a knitting needle.
+# Surface area over squared length: 0.06 for a knitting needle.
 _LEAST_AREA = 1e-3
 
 

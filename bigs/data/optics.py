@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-# Radii, as tangents of the angle to the axis, at which a lens is looked at: nothing sees 87 degrees aside.
+# Radii, as tangents of the angle to the axis, at which a lens is checked: no lens sees 87 degrees off axis.
 _RADII = np.linspace(0.0, 20.0, 20_001)
 
 

@@ -18,20 +18,21 @@ from bigs.data.meshes import LONGEST_M, SHORTEST_M
 from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
 from bigs.types import Entity, Side
 
-# Projection is singular at the camera, and 100 m away a hand is a single pixel.
+# Projection is singular at the camera, and at 100 m a hand is a single pixel.
 NEAREST_M, FARTHEST_M = 0.01, 100.0
-# In standard deviations of MANO's shapes: nobody has 10, and at 50 no hand is left of the model.
+# In standard deviations of MANO's shapes: no person has 10, and at 50 the model is no hand any more.
 ODD_BETA, MOST_BETA = 10.0, 50.0
-# A box has eight corners; fewer points tell no shape, and with less than a hundred it is guessed.
+# A box has eight corners; fewer points give no shape, and fewer than a hundred only a rough one.
 LEAST_POINTS, FEW_POINTS = 8, 100
-# A point so many times further from the middle than nine in ten is none of the object's (1.9 in real ones).
+# A point this many times further from the middle than nine in ten others is not on the object (1.9 in real
+# clips).
 STRAY = 10.0
-# The object's extent in the image over the root of its mask's area: 1.5 to 3.4 in whole clips, more for what
-# is thin or half hidden, less for what fills the image.
+# The object's extent in the image over the root of its mask's area: 1.5 to 3.4 in whole clips, more for thin
+# or half hidden objects, less for what fills the image.
 ODD_SIZE, WRONG_SIZE = (0.4, 6.0), (0.1, 15.0)
-# A mask of fewer pixels tells no size.
+# A mask with fewer pixels says nothing about size.
 _LEAST_AREA = 20
-# The challenge's file has float16, and puts the scene into a space where the camera is at distance 2.
+# The challenge's file has float16, and scales the scene so that the camera is at distance 2.
 _HALF_MAX, _HALF_SPACE = 65504.0, 2.0
 
 
@@ -133,7 +134,7 @@ def _misplaced(
     clip: Clip, entity: Entity, places: np.ndarray, valid: np.ndarray, notes: list[str]
 ) -> np.ndarray:
     """In which of the valid frames something is behind the camera or too far away, [T] bool."""
-    if clip.annotated:  # what was measured is not ours to mend
+    if clip.annotated:  # measured poses are not repaired
         return np.zeros(len(valid), dtype=bool)
     seen = _in_camera(clip, places)
     behind = valid & (seen[:, 2] < NEAREST_M)

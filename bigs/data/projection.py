@@ -7,7 +7,7 @@ from scipy.linalg import rq
 
 from bigs.checks import InputError
 
-# Projections are kept in float32, so the camera in one is known to about seven digits.
+# Projections are stored as float32, so a camera is known to about seven digits.
 CAMERA_TOLERANCE = 1e-4
 # A focal length below this fraction of the image width sees more than 179.8 degrees: a broken file.
 _MIN_FOCAL = 1e-3

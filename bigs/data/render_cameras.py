@@ -31,7 +31,7 @@ class CameraPath(NamedTuple):
     """Pictures to render, in order."""
 
     cameras: list[RenderCamera]
-    fps: float | None  # pictures a second, where the file says so
+    fps: float | None  # frames per second, if the file has it
 
 
 def load_cameras(

@@ -50,7 +50,7 @@ TRANSFORMS_FILE = "transforms.json"
 _IMAGE_FOLDERS = ("image", "images")
 _MASK_FOLDERS = ("mask", "masks")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-# Intrinsics of one camera, written frame by frame, agree to this many pixels.
+# Intrinsics of one camera that are stored per frame agree to this many pixels.
 _K_TOLERANCE = 1e-3
 # Of the image's side: a shorter focal length sees more than 179.8 degrees.
 _LEAST_FOCAL = 1e-3
@@ -154,7 +154,7 @@ def _read_colmap(folder: Path, size: tuple[int, int]) -> SfmModel:
     check_model_files(place)
     try:
         model = pycolmap.Reconstruction(str(place))
-    except Exception as error:  # pycolmap raises what its C++ throws
+    except Exception as error:  # pycolmap raises its C++ exceptions
         raise InputError(f"{place}: expected a COLMAP model, found a damaged one ({error})") from None
     used = {image.camera_id for image in model.images.values()}
     if len(used) != 1:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bigs.checks import InputError
 
-# Estimators wind an axis-angle up by a turn or two; from here on float32 loses the angle itself.
+# Estimators add whole turns to an axis-angle; from here on float32 loses the angle itself.
 MOST_TURN = 100.0
 
 

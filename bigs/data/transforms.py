@@ -24,7 +24,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # Rotations in such files are printed with six digits or more.
 _RIGID_TOLERANCE = 1e-4
 
-# So many pictures, each of so many pixels, are rendered at most: an hour and half a gigabyte.
+# At most this many pictures of this many pixels are rendered: an hour, and half a gigabyte.
 MOST_CAMERAS, MOST_PIXELS = 10_000, 7680 * 4320
 
 
@@ -75,7 +75,7 @@ def cameras_in(
     for index, stored in enumerate(frames):
         where = f"{path}: frames[{index}]"
         entry = mapping_field(where, stored)
-        # What a frame says about its lens overrides what the file says for all.
+        # A frame's own lens overrides the file's.
         values = {**document, **entry}
         _check_lens(where, values)
         width, height = size_field(f"{where}.", values, "w", "h", size)

@@ -14,8 +14,8 @@ class TriplaneConfig:
 
     features: int = 32
     resolution: int = 256
-    # Standard deviation of the random start. The released code takes 1; a smaller one keeps the first
-    # images close to the initial colours, which matters when there are hundreds of steps, not thousands.
+    # Standard deviation of the random start. The released code takes 1; a smaller one keeps the first images
+    # close to the initial colours, which matters with hundreds of steps instead of thousands.
     init_std: float = 0.1
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.ndimage
 
-# A surface that is turned away further than this is seen at a glancing angle only, cosine.
+# Surface that is turned away further than this is seen at a glancing angle only, cosine.
 _LEAST_COSINE = 0.2
-# Pixels of the depth buffer on either side of a sample's own that it closes, so that no gap shows what lies
+# A sample also covers this many pixels of the depth buffer on either side, so that no gap shows what lies
 # behind.
 _CLOSED = 2
 
@@ -76,7 +76,8 @@ def seen_in(
     row, column, depth, inside = views.pixels(t, points)
     cosine = (views.directions(t, points) * normals).sum(-1)
     facing = cosine > _LEAST_COSINE
-    # The buffer holds the nearest of some pixels around: on a slope that is nearer than the point's own.
+    # The buffer holds the nearest depth of some pixels around, which on a slope is nearer than the point's
+    # own.
     slope = np.sqrt(1.0 - cosine.clip(_LEAST_COSINE, 1.0) ** 2) / cosine.clip(_LEAST_COSINE, 1.0)
     nearest = views.nearest_depths(t, surface)[row, column] + _CLOSED * depth / views.K[0, 0] * slope
     return inside & facing & views.shown[t, row, column] & (depth < nearest + tolerance)
@@ -90,7 +91,8 @@ def times_empty(views: ObjectViews, points: np.ndarray, surface: np.ndarray, tol
     count = np.zeros(len(points), dtype=int)
     for t in range(len(views.shown)):
         row, column, depth, inside = views.pixels(t, points)
-        # Of a seen surface the far side shows nowhere; where it alone lies behind, nothing is said.
+        # A surface that is seen from one side is unseen from the other; if only that side lies behind,
+        # nothing is known.
         nearest = views.nearest_depths(t, surface)[row, column]
         count += inside & views.shown[t, row, column] & np.isfinite(nearest) & (depth < nearest - tolerance)
     return count

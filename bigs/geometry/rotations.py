@@ -46,7 +46,7 @@ _LEFT = torch.tensor(
     ],
     dtype=torch.float32,
 )
-# Under the root of a squared angle, which has no gradient at zero; far below what any angle is known to.
+# Under the root of a squared angle, which has no gradient at zero; far below any angle's accuracy.
 _TINY = 1e-30
 
 

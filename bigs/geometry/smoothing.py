@@ -71,7 +71,7 @@ def smooth_rotations(rotations: Tensor, weights: Tensor, sigma: float) -> Tensor
     return fitted
 
 
-# Residuals (metres, radians, or pixels over focal length) below what any estimator can measure.
+# Residuals (metres, radians, or pixels over focal length) below this are smaller than any estimator's error.
 _EXACT = 1e-3
 
 

@@ -11,7 +11,7 @@ from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.geometry.mesh import sample_surface
 from bigs.geometry.surface import DistanceGrid, extract_mesh
 
-# Samples of the surface that are looked at, and those that may hide them.
+# Number of surface samples that are tested, and of those that may occlude them.
 _SAMPLES, _OCCLUDERS = 4000, 20_000
 
 

@@ -49,7 +49,7 @@ def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
         return np.full(allowed.shape, float(max(allowed.shape)), dtype=np.float32)
     outside = scipy.ndimage.distance_transform_edt(~allowed)
     inside = scipy.ndimage.distance_transform_edt(allowed)
-    # Both count from pixel centres, so the border between two pixels is half a pixel from either.
+    # Both distances count from pixel centres, so the border between two pixels is half a pixel from either.
     return (np.where(allowed, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 
@@ -86,7 +86,7 @@ def silhouette_around_points(
     return silhouette_distance(allowed | (together >= _PATCH - 0.5))
 
 
-# So many points within reach of one another are no strays.
+# This many points within reach of one another are no outliers.
 _PATCH = 4.0
 
 
@@ -98,7 +98,7 @@ class VisualHull:
     K: np.ndarray  # [3, 3] intrinsics
     rotations: np.ndarray  # [T, 3, 3]; x_cam = R x + centre
     centers: np.ndarray  # [T, 3] metres
-    # How many frames must agree that a point is outside: one wrong mask or pose then carves nothing.
+    # How many frames must agree that a point is outside, so that one wrong mask or pose carves nothing.
     agreeing: int = 1
 
     def distance(self, points: np.ndarray, stop: float = np.inf) -> np.ndarray:
@@ -152,7 +152,7 @@ class VisualHull:
         slopes = [
             self.distance(points + step * axis) - self.distance(points - step * axis) for axis in np.eye(3)
         ]
-        # The slope is exactly zero deep inside; there the direction from the middle decides.
+        # Deep inside the slope is exactly zero; there the direction from the middle decides.
         away = points - points.mean(0)
         return np.stack(slopes, axis=-1) + 1e-3 * away / np.linalg.norm(away, axis=-1, keepdims=True).clip(
             1e-9
@@ -210,7 +210,7 @@ def blend_with_points(
     """
     corners = grid.points()
     values = grid.values.ravel().copy()
-    # Far outside, the sign is known already and only the sign matters there.
+    # Far outside only the sign matters, and it is known.
     near = np.flatnonzero(values < reach)
     distance, index = scipy.spatial.cKDTree(points).query(
         corners[near], k=min(neighbours, len(points)), distance_upper_bound=reach, workers=-1

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.spatial
 from scipy.spatial.transform import Rotation
 
-# An axis of revolution is tried by turns of one of these shares of a circle.
+# An axis of revolution is tested by rotations of these shares of a full turn.
 _TURNS = 12
 
 
@@ -27,7 +27,7 @@ class SeenSurface(NamedTuple):
     colors: np.ndarray  # [N, 3] in [0, 1]
 
 
-# Which of the points [N, 3] lie where the clip shows that there is no object.
+# Which of the points [N, 3] lie where the clip shows no object.
 IsEmpty = Callable[[np.ndarray], np.ndarray]
 
 

@@ -11,14 +11,14 @@ import scipy.spatial
 from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
 
-# Candidates that are refined, those of them that are polished, rounds of refinement, and samples that vote.
+# Number of candidates that are refined, of those that are polished, of rounds, and of samples that vote.
 _FINALISTS = 14
 _POLISHED = 4
 _ROUNDS = 6
 _VOTERS = 400
 # Cosine of 35 degrees.
 _LEAST_COSINE = 0.82
-# No more symmetries than these are looked for: three planes fill every octant.
+# Most symmetries that are searched: three planes fill every octant.
 _MOST = 3
 
 
@@ -30,22 +30,22 @@ class SymmetryConfig:
     false one that was sharp had more than 0.66.
     """
 
-    # A carried point meets seen surface when it is as near as this, with a normal within 35 degrees.
+    # A carried point meets seen surface if it is this near, with a normal within 35 degrees.
     tolerance: float = 0.02
-    # Share of the carried points that must meet seen surface.
+    # Smallest share of the carried points that must meet seen surface (support).
     least_support: float = 0.12
-    # And of those that say anything: the others contradict the clip.
+    # Smallest share of support in support and contradiction together.
     least_share: float = 0.75
-    # Share that may contradict, at least, and as a share of the support: where much was seen, wrong poses and
-    # masks contradict everywhere a little.
+    # Largest share of contradiction, absolute and relative to the support: where much was seen, wrong poses
+    # and masks contradict everywhere a little.
     most_contradiction: float = 0.06
     contradiction_per_support: float = 0.13
-    # Share that must fall where nobody looked: a symmetry that adds nothing is of no use.
+    # Smallest share that must fall where nobody looked: otherwise the symmetry adds nothing.
     least_new: float = 0.05
-    # The colours that meet must be nearer to each other than this share of what chance would make them.
+    # Colours that meet must differ by less than this share of random pairs' difference.
     most_color_error: float = 0.85
-    # How much worse, in support less three times the contradictions, a shift by 1.5 tolerances or a turn by 5
-    # degrees must be.
+    # Loss, in support less three times the contradictions, that a shift by 1.5 tolerances or a turn by 5
+    # degrees must cause.
     least_sharpness: float = 0.015
 
 
@@ -65,7 +65,7 @@ def find_symmetries(
     found: list[Symmetry] = []
     while len(found) < _MOST and len(surface.points) >= 100:
         judge = _Judge(surface, is_empty, config)
-        # An axis completes more than any plane, and only a body of revolution passes for one.
+        # An axis completes more than any plane, and only a body of revolution passes as one.
         best = None if found else judge.best(_axis_candidates(surface), found)
         best = best or judge.best(_plane_candidates(surface), found)
         if best is None:
@@ -86,7 +86,7 @@ class _Judge:
         self.tolerance = config.tolerance * self.size
         self.tree = scipy.spatial.cKDTree(surface.points)
         middle = np.median(surface.colors, axis=0)
-        # Of two colours drawn at random from the surface; never so small that noise decides.
+        # Difference of two random colours of the surface; never so small that noise decides.
         self.chance = max(1.4 * float(np.abs(surface.colors - middle).mean()), 0.02)
 
     def images(self, symmetry: Symmetry) -> list[SeenSurface]:
@@ -208,7 +208,7 @@ def _plane_candidates(surface: SeenSurface) -> list[Symmetry]:
     direction = between / np.maximum(length, 1e-9)[:, None]
     mirrored = n[first] - 2.0 * (n[first] * direction).sum(-1, keepdims=True) * direction
     good = (length > 0.15 * size) & ((mirrored * n[second]).sum(-1) > 0.94)
-    # A pair whose normals are the same and at right angles to what joins them is mirrored by chance as well.
+    # A pair with equal normals, orthogonal to the line between them, is mirrored by chance as well.
     good &= np.abs((n[first] * direction).sum(-1)) > 0.2
     good &= np.abs(c[first] - c[second]).mean(-1) < 0.15
     direction = direction[good]

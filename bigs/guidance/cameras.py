@@ -22,12 +22,12 @@ class Orbit(NamedTuple):
     """The sphere: where it is, and which way is up and front."""
 
     center: Tensor  # [3] metres, the object's middle
-    radius: float  # metres, of a ball about the object
+    radius: float  # metres, radius of a ball about the object
     up: Tensor  # [3] unit
-    front: Tensor  # [3] unit, at right angles to `up`
+    front: Tensor  # [3] unit, orthogonal to `up`
 
 
-# Field of view in degrees, and the share of the picture's half that the object's ball fills.
+# Field of view in degrees, and the share of the half picture that the object's ball fills.
 _FIELD_OF_VIEW = 40.0
 _FILL = 0.9
 
@@ -40,7 +40,7 @@ def make_orbit(points: Tensor, up: Tensor, front: Tensor) -> Orbit:
     up = torch.nn.functional.normalize(up, dim=0)
     across = front - (front @ up) * up
     if float(across.norm()) < 1e-3:
-        # The front is straight above or below: any direction at right angles serves.
+        # The front is straight above or below: any orthogonal direction serves.
         across = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())])
     return Orbit(center, radius, up, torch.nn.functional.normalize(across, dim=0))
 
@@ -69,7 +69,7 @@ def virtual_cameras(orbit: Orbit, directions: Tensor, size: int) -> VirtualCamer
     half = math.radians(0.5 * _FIELD_OF_VIEW)
     distance = orbit.radius / math.sin(half * _FILL)
     level = directions @ orbit.up
-    # Of a camera straight above or below the front is up in the picture.
+    # For a camera straight above or below, the front is up in the picture.
     above = torch.where(level.abs()[:, None] > 0.999, -level.sign()[:, None] * orbit.front, orbit.up)
     forward = -directions
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, above), dim=-1)

@@ -11,16 +11,17 @@ from torch.nn.functional import interpolate
 
 from bigs.checks import InputError
 
-# Sides of a crop, in sides of the object's box: what a step draws from, so that size is not learned.
+# Sides of a crop relative to the object's box; a step draws one, so that size is not learned.
 ZOOMS = (1.1, 1.6)
-# A mask of fewer pixels shows nothing, and one far smaller than the clip's largest little of the object.
+# A mask with fewer pixels shows nothing; one far smaller than the clip's largest shows too little of the
+# object.
 _LEAST_PIXELS, _LEAST_SHARE = 64, 0.25
 
 
 class Crop(NamedTuple):
     """A square around the object, `ZOOMS[1]` times its box, centred on it."""
 
-    picture: Tensor  # [3, S, S] uint8; the object over white, with nothing left of what is around it
+    picture: Tensor  # [3, S, S] uint8; the object on white, without its surroundings
     mask: Tensor  # [1, S, S] uint8, 255 on the object
 
 
@@ -83,7 +84,7 @@ def draw_pictures(
         whole = crop.mask.shape[-1]
         zoom = float(torch.empty(()).uniform_(ZOOMS[0], ZOOMS[1], generator=generator))
         side = max(1, round(whole * zoom / ZOOMS[1]))
-        # The object's box fills 1 / zoom of the side; it is moved about as far as it stays inside.
+        # The object's box fills 1 / zoom of the side and is moved as far as it stays inside.
         reach = max(0.0, (side - whole / ZOOMS[1]) / 2.0)
         moves = (2.0 * torch.rand(2, generator=generator) - 1.0) * reach
         top, left = (min(max(round((whole - side) / 2 + float(m)), 0), whole - side) for m in moves)

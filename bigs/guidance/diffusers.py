@@ -28,7 +28,7 @@ class DiffusionConfig:
     edge_weights: Path | None = None  # PiDiNet's published file; `soft_edges` without it
     token: Path | None = None  # learned word for the object
     prompts: PromptConfig = field(default_factory=PromptConfig)
-    guidance_scale: float = 50.0  # how far beyond the unconditional estimate
+    guidance_scale: float = 50.0  # guidance scale, relative to the unconditional estimate
     conditioning_scale: float = 0.3  # weight of the ControlNet
     device: Device = "auto"
     precision: Precision = "auto"
@@ -101,7 +101,7 @@ class StableDiffusion:
 
     @property
     def familiar(self) -> float | None:
-        return None  # nobody wrote down what it learned from
+        return None  # its training data are unknown
 
     @property
     def fingerprint(self) -> str:

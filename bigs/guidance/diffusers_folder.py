@@ -19,13 +19,13 @@ Precision = Literal["auto", "float32", "float16", "bfloat16"]
 _DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 Device = Literal["auto", "cpu", "cuda"]
 
-# Each component of a model folder: the class that reads it, and the files of which it must have one.
+# Each component of a model folder: the class that reads it, and files of which one must exist.
 COMPONENTS = {
     "unet": ("diffusers.UNet2DConditionModel", ("config.json",)),
     "vae": ("diffusers.AutoencoderKL", ("config.json",)),
     "text_encoder": ("transformers.CLIPTextModel", ("config.json",)),
     "tokenizer": ("transformers.CLIPTokenizer", ("tokenizer.json", "vocab.json")),
-    # Whatever sampler the folder names, its noise schedule is read.
+    # Only the noise schedule of the folder's sampler is read.
     "scheduler": ("diffusers.DDIMScheduler", ("scheduler_config.json",)),
 }
 _NETWORKS = ("unet", "vae", "text_encoder", "controlnet")
@@ -143,7 +143,7 @@ def _class(name: str) -> Any:
     try:
         return getattr(_library(library), attribute)
     except (ImportError, RuntimeError) as error:
-        # Both libraries look for torchvision, and one built for another torch takes them down.
+        # Both libraries probe for torchvision, and fail if it was built for another torch.
         raise InputError(
             f"diffusion prior: expected {name}, found an import error, perhaps from a torchvision that "
             f"does not match torch (pip uninstall torchvision; bigs needs none): {_reason(error)}"
@@ -191,7 +191,7 @@ def _load(source: str, name: str, kind: str, subfolder: str) -> Any:
             options["variant"] = "fp16"
     try:
         loaded = reader.from_pretrained(source, **options)
-    except Exception as error:  # the libraries promise no particular exception for damaged files
+    except Exception as error:  # the libraries raise many kinds of errors for damaged files
         if local:
             raise InputError(
                 f"{source}: expected a readable component {name}, found: {_reason(error)}"
@@ -231,7 +231,7 @@ def _check_fit(parts: Parts, model: str, controlnet: str | None) -> None:
             f"found {len(parts.tokenizer)}"
         )
     check_choice(f"{model}: scheduler: prediction_type", parts.scheduler.config.prediction_type, PREDICTIONS)
-    # Some tokenizers name no limit, and texts beyond the encoder's would overrun it.
+    # Some tokenizers state no limit, and longer texts would overrun the encoder.
     limit = parts.text_encoder.config.max_position_embeddings
     parts.tokenizer.model_max_length = min(parts.tokenizer.model_max_length, limit)
     if controlnet is None or parts.controlnet is None:

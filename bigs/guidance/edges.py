@@ -5,11 +5,11 @@ from __future__ import annotations
 from kornia.filters import gaussian_blur2d, spatial_gradient
 from torch import Tensor
 
-# Standard deviation of the blur before differences are taken: one pixel at 512, where the published soft-edge
-# networks work, and never less, because differences of neighbours cannot follow steeper slopes.
+# Standard deviation of the blur before differences: one pixel at 512, where the published soft-edge networks
+# work, and never less, since differences of neighbours cannot follow steeper slopes.
 _BLUR = 1.0 / 512.0
 _LEAST_BLUR = 1.0
-# The slope, in intensity per blur, that counts half: a step of 0.1, which is that steep in its middle.
+# Slope, in intensity per blur, that gives 0.5: the steepest of a step of 0.1.
 _HALF_SLOPE = 0.04
 
 
@@ -30,7 +30,7 @@ def soft_edges(images: Tensor) -> Tensor:
     # Three standard deviations to each side.
     width = 2 * round(3.0 * blur) + 1
     smooth = gaussian_blur2d(images, (width, width), (blur, blur), border_type="replicate")
-    # The same step is less steep the more it is blurred.
+    # More blur makes the same step less steep.
     slope = blur * spatial_gradient(smooth, mode="sobel", normalized=True).square().sum(2).sqrt()
     strongest = slope.amax(1, keepdim=True).square()
     return strongest / (strongest + _HALF_SLOPE**2)

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-# Of each tensor so many values are looked at, evenly spread: whole networks take long to read, and two
-# trainings of one differ everywhere.
+# This many values of each tensor enter, evenly spread: whole networks take long to read, and two trainings
+# differ everywhere.
 _VALUES = 1024
 
 

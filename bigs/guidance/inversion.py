@@ -20,7 +20,7 @@ from bigs.guidance.diffusers_folder import Parts
 from bigs.guidance.sds import add_noise
 from bigs.guidance.token_file import Token, new_words
 
-# Several ways to say it, so that the word comes to mean the object and not the sentence.
+# Several sentences, so that the word comes to mean the object and not the sentence.
 TEMPLATES = (
     "a photo of a {}",
     "a close-up photo of a {}",
@@ -28,7 +28,7 @@ TEMPLATES = (
     "a picture that shows one {}",
     "a rendering of a {}",
 )
-# float16 loses gradients below 6e-8; the loss is magnified by so much, and its gradient made smaller again.
+# float16 loses gradients below 6e-8, so the loss is scaled by this much and its gradient scaled back.
 _FLOAT16_SCALE = 1024.0
 
 
@@ -122,7 +122,7 @@ class Inversion:
             noisy = add_noise(latents, noise, timesteps, alphas)
             control = None
             if parts.controlnet is not None:
-                # The ControlNet is told the plain name, as when the prior is used.
+                # The ControlNet gets the plain name, as when the prior is used.
                 texts = self._texts(template.format(config.object_name))
                 control = texts, edges(pictures).to(texts), config.conditioning_scale
         texts = self._texts(template.format(f"{config.token} {config.object_name}"))

@@ -17,16 +17,16 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d
 from bigs.checks import InputError
 from bigs.weights import checked_weight, load_weights
 
-# Blocks of each of the four scales; with the first convolution these are 16 layers.
+# Blocks per scale; with the first convolution these are 16 layers.
 _BLOCKS = (3, 4, 4, 4)
-# The kinds of kernels, in turns over the layers: to the centre, around the ring, outwards, ordinary.
+# Kinds of kernels, repeated over the layers: central, angular, radial, ordinary.
 _KINDS = ("central", "angular", "radial", "ordinary")
-# For each place of a 3 x 3 kernel, row by row, the place that is taken away from it.
+# For each place of a 3 x 3 kernel, row by row, the place that is subtracted.
 _AROUND = (3, 0, 1, 6, 4, 2, 7, 8, 5)
-# Where a radial kernel's weights, save the first, go in 5 x 5: on the outer ring, negated on the inner one.
+# Where a radial kernel's weights, except the first, go in 5 x 5: on the outer ring, negated on the inner one.
 _OUTER = (0, 2, 4, 10, 14, 20, 22, 24)
 _INNER = (6, 7, 8, 11, 13, 16, 17, 18)
-# How far the four convolutions of the module that gathers context are spread.
+# Dilations of the context module's four convolutions.
 _DILATIONS = (5, 7, 9, 11)
 
 
@@ -34,7 +34,9 @@ _DILATIONS = (5, 7, 9, 11)
 class PiDiNet:
     """The network; called with pictures it returns their edges."""
 
-    weights: dict[str, Tensor]  # by their published names; difference kernels are ordinary ones here
+    weights: dict[
+        str, Tensor
+    ]  # by their published names; difference kernels have been turned into ordinary ones
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:
@@ -90,7 +92,7 @@ class _Layers:
 
     def __init__(self, path: Path, found: dict[str, Tensor]) -> None:
         self._path, self._found = path, found
-        # Only the radial kernels show which kind of file it is.
+        # Only the radial kernels reveal the kind of file.
         self._converted = found.get("block1_2.conv1.weight", torch.empty(0)).shape[-1:] == (5,)
         self.weights: dict[str, Tensor] = {}
 

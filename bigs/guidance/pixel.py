@@ -14,7 +14,7 @@ from bigs.guidance.fingerprint import fingerprint
 
 PIXELS = 64
 _TIMESTEPS = 1000
-# Patches of so many pixels a side become channels: the network then works on 16 x 16 and smaller.
+# Patches of this many pixels a side become channels, so that the network works on 16 x 16 and smaller.
 _PATCH = 4
 
 

@@ -23,9 +23,9 @@ class PixelTrainingConfig:
     batch: int = 32
     lr: float = 4e-4
     seed: int = 0
-    # Edges and view are each hidden from the network in this share of the pictures, so that it learns to do
-    # without, and edges are blurred, shifted by up to so many pixels and thinned: those of an unfinished
-    # object are as wrong.
+    # Edges and view are each hidden in this share of the pictures, so that the network learns to do without.
+    # Edges are also blurred, shifted by up to this many pixels and thinned, as wrong as those of an
+    # unfinished object.
     hide_edges: float = 0.4
     hide_view: float = 0.2
     edge_shift: int = 3
@@ -69,7 +69,7 @@ class PixelTraining:
         share = (timesteps.to(images) + 0.5) / len(self._alphas)
         found = self.net(add_noise(clean, noise, timesteps, self._alphas), share, edges, views)
         loss = (found - (a.sqrt() * noise - (1.0 - a).sqrt() * clean)).square().mean()
-        # A short rise at the start, and a fall to a tenth at the end.
+        # A short warm-up, then a decay to a tenth.
         progress = self.step / config.steps
         factor = min(1.0, (self.step + 1) / 100) * (1.0 - 0.9 * progress)
         for group in self.optimizer.param_groups:
@@ -79,7 +79,7 @@ class PixelTraining:
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         self.optimizer.step()
         self.step += 1
-        # The mean forgets with a tenth of the steps so far, at the most a thousand.
+        # The running mean spans a tenth of the steps so far, at most a thousand.
         keep = 1.0 - 1.0 / min(1000.0, 1.0 + 0.1 * self.step)
         with torch.no_grad():
             for mean, value in zip(self.mean.parameters(), self.net.parameters(), strict=True):

@@ -12,8 +12,8 @@ from bigs.checks import InputError
 
 VIEWS = ("front", "side", "back", "overhead", "bottom")
 _FRONT, _SIDE, _BACK, _OVERHEAD, _BOTTOM = range(len(VIEWS))
-# A view is the front within so much of azimuth 0, the back within as much of the opposite side, and neither
-# beyond so much of elevation.
+# A view is the front within this azimuth of 0, the back within this of the opposite side, and neither beyond
+# this elevation.
 _HALF_FRONT, _STEEP = math.radians(45.0), math.radians(60.0)
 
 
@@ -24,7 +24,7 @@ class PromptConfig:
     object_name: str = "object"
     prompt: str = "a photo of a {object}, high quality, realistic"
     negative: str = "blurry, distorted, deformed, low quality, text, watermark, hand, fingers"
-    view_dependent: bool = True  # say which side is seen
+    view_dependent: bool = True  # whether to name the view
 
     def __post_init__(self) -> None:
         if "{object}" not in self.prompt:

@@ -8,8 +8,8 @@ from torch import Tensor
 from bigs.guidance.denoiser import Conditions, Denoiser
 from bigs.guidance.sds import add_noise, resized
 
-# The share of the schedule at which the model is asked: there it has to know the object, for nothing but its
-# edges show. The noise is drawn so often for each picture.
+# Share of the schedule at which the model is asked: nothing but edges shows there, so it has to know the
+# object. Then, draws of noise per picture.
 _NOISE = 0.9
 _DRAWS = 4
 
@@ -33,7 +33,7 @@ def picture_residual(denoiser: Denoiser, images: Tensor, conditions: Conditions,
     alphas_cumprod = denoiser.alphas_cumprod.to(latents)
     timestep = round(_NOISE * (len(alphas_cumprod) - 1))
     timesteps = torch.full((len(latents),), timestep, device=latents.device)
-    # z = (z_t - sqrt(1 - a) eps) / sqrt(a), so an error of the noise is one of the latents, so much larger.
+    # z = (z_t - sqrt(1 - a) eps) / sqrt(a), so an error of the noise is a larger error of the latents.
     larger = (1.0 - alphas_cumprod[timestep]) / alphas_cumprod[timestep]
     generator = torch.Generator().manual_seed(seed)
     errors = []

@@ -21,7 +21,7 @@ class SdsConfig:
     t_first: tuple[float, float] = (0.5, 0.98)  # range at progress 0: noise hides all but the rough shape
     t_last: tuple[float, float] = (0.02, 0.3)  # range at progress 1: only detail is left to judge
     weighting: Weighting = "sigma2"
-    max_grad_norm: float | None = None  # limit of each latent's gradient, over all its values
+    max_grad_norm: float | None = None  # limit of the norm of each latent's gradient
 
     def __post_init__(self) -> None:
         for name in ("t_first", "t_last"):

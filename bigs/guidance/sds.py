@@ -64,7 +64,7 @@ def sds_loss(
         if config.max_grad_norm is not None:
             gradient = limited(gradient, config.max_grad_norm)
     loss: Tensor = _GivenGradient.apply(latents, gradient / len(latents))
-    return loss.to(images.device)  # the prior may live elsewhere
+    return loss.to(images.device)  # the prior may live on another device
 
 
 def add_noise(latents: Tensor, noise: Tensor, timesteps: Tensor, alphas_cumprod: Tensor) -> Tensor:
@@ -90,7 +90,7 @@ class _GivenGradient(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, gradient: Tensor) -> Tensor:
         ctx.save_for_backward(gradient)
-        # Values that are not finite must show, even if the estimate hides them.
+        # Non-finite values must show, even if the estimate hides them.
         return 0.5 * gradient.float().square().sum() + 0.0 * values.float().sum()
 
     @staticmethod

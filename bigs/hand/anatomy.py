@@ -19,12 +19,12 @@ class Finger(NamedTuple):
 
     base: tuple[float, float, float]  # knuckle; for the thumb the saddle joint at the wrist
     direction: tuple[float, float, float]  # of the first bone; need not be unit
-    curl: float  # degrees of flexion added at each later joint in the rest pose
-    lengths: tuple[float, float, float]  # of the three bones, the last one to the skin of the tip
-    radii: tuple[float, float, float, float]  # of the flesh at the three joints and at the tip
+    curl: float  # degrees of flexion added at each further joint in the rest pose
+    lengths: tuple[float, float, float]  # lengths of the three bones, the last one to the skin of the tip
+    radii: tuple[float, float, float, float]  # radii of the flesh at the three joints and at the tip
 
 
-# In MANO's order, which puts the pinky before the ring finger and the thumb last.
+# In MANO's order: the pinky before the ring finger, the thumb last.
 FINGERS: dict[str, Finger] = {
     "index": Finger(
         (0.0075, 0.0020, 0.0290),
@@ -81,7 +81,7 @@ def from_wrist(x: float, y: float, z: float) -> np.ndarray:
 def chain_points(finger: Finger) -> np.ndarray:
     """The three joints and the tip [4, 3] of a finger."""
     direction = np.array(finger.direction) / np.linalg.norm(finger.direction)
-    # Flexion turns about the axis that is parallel to the palm and square to the finger.
+    # Flexion turns about the axis that is parallel to the palm and perpendicular to the finger.
     axis = np.cross(direction, [0.0, -1.0, 0.0])
     axis /= np.linalg.norm(axis)
     points = [np.array(finger.base)]
@@ -163,6 +163,6 @@ def hand_distance(points: np.ndarray) -> np.ndarray:
         palm = smooth_min(palm, capsule_distance(points, capsule), 0.012)
     hand = palm
     for finger in FINGERS.values():
-        # Narrow enough that neighbouring fingers do not grow together above the web.
+        # Narrow enough that neighbouring fingers do not merge above the web.
         hand = smooth_min(hand, finger_distance(points, finger), 0.006)
     return hand

@@ -28,11 +28,11 @@ REQUIRED = (
     "hands_mean",
 )
 
-# Fingertip vertices (thumb, index, middle, ring, pinky) of MANO's own mesh, which carries no list of them.
+# Fingertip vertices (thumb, index, middle, ring, pinky) of MANO's own mesh, whose file does not list them.
 MANO_VERTICES = 778
 MANO_TIPS = (744, 320, 443, 554, 671)
 
-# A hand in metres is this large; one in millimetres or another thing altogether is not.
+# Size of a hand in metres; one in millimetres lies outside.
 HAND_EXTENT = (0.05, 0.6)
 
 # Largest deviation from 1 of a row that should sum to 1.
@@ -162,11 +162,11 @@ def _listed(fields: dict[str, Any]) -> str:
 def _floats(fields: dict[str, Any], key: str, shape: tuple[int | str, ...] | None, name: str) -> np.ndarray:
     value = fields[key]
     if scipy.sparse.issparse(value):
-        # A forged shape must not be made dense before it is known to be the right one.
+        # Check the shape before a forged sparse matrix is made dense.
         if shape is not None:
             check_shape(f"{name}, {key}", value, shape)
         value = value.toarray()
-    # Lists may be ragged, or of text; MANO's own fields are arrays.
+    # Lists may be ragged or hold text; MANO's own fields are arrays.
     if not isinstance(value, np.ndarray | np.number):
         raise InputError(f"{name}, {key}: expected an array of numbers, found {type(value).__name__}")
     array = np.asarray(value)
@@ -206,7 +206,7 @@ def _check_rows_sum_to_one(name: str, matrix: np.ndarray) -> None:
 
 def _check_tree(fields: dict[str, Any], name: str) -> None:
     table = _integers(fields, "kintree_table", (2, len(MANO_PARENTS)), name)
-    # The root's own parent is stored as 2**32 - 1 or -1; only the others say anything.
+    # The root's own parent is stored as 2**32 - 1 or -1 and is ignored.
     found = tuple(int(parent) for parent in table[0, 1:])
     if found != MANO_PARENTS[1:]:
         raise InputError(

@@ -97,7 +97,8 @@ class HandModel(nn.Module):
             self.register_buffer(name, _tensor(values, torch.float32), persistent=False)
         self.register_buffer("faces", _tensor(faces, torch.int64), persistent=False)
         self.register_buffer("tip_vertex_ids", _tensor(tip_vertex_ids, torch.int64), persistent=False)
-        # Most stand-ins have no correctives, and the product with zeros would be the largest cost of a pose.
+        # Most other models have no correctives, and the product with zeros would be the largest cost of a
+        # pose.
         self.has_posedirs = bool(self.posedirs.any())
 
     def rest_vertices(self, betas: Tensor) -> Tensor:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# The image statistics that the network was trained with, for values in [0, 1].
+# Image statistics of the network's training data, for values in [0, 1].
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
-# Convolutions done when a block ends: there the features are compared, then the image is halved.
+# Number of convolutions at the end of each block, where features are compared and the image is halved.
 BLOCK_ENDS = (2, 4, 7, 10, 13)
-# Four halvings leave at least one pixel of so many.
+# After four halvings, images of this size still have a pixel.
 _LEAST_SIZE = 16
 
 
@@ -72,7 +72,7 @@ def perceptual_distance(pred: Tensor, target: Tensor, weights: VggWeights) -> Te
 
 
 def _unit(features: Tensor) -> Tensor:
-    # The small number is below the root, where a pixel without any feature would have no gradient.
+    # The small number lies below the root, where a pixel without any feature would have no gradient.
     return features * (features.square().sum(1, keepdim=True) + 1e-10).rsqrt()
 
 

@@ -12,9 +12,9 @@ from bigs.checks import InputError
 from bigs.losses.perceptual import BLOCK_ENDS, VggWeights
 from bigs.weights import checked_weight, load_weights
 
-# Where torchvision's `features` has its convolutions.
+# Indices of the convolutions in torchvision's `features`.
 _LAYERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-# torchvision's whole network, its features alone, and the slices into which the lpips package cuts them.
+# Key prefixes: torchvision's whole network, its features alone, and the slices of the lpips package.
 _CONVOLUTION = re.compile(r"^(?:(?:.*\.)?(?:features|slice[1-5])\.)?(\d+)\.(weight|bias)$")
 _CHANNELS = re.compile(r"^lin(\d)\.model\.1\.weight$")
 

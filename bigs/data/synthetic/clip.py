@@ -32,10 +32,10 @@ from bigs.geometry.mesh import face_areas, vertex_normals
 from bigs.types import MASK_VALUES, SIDES, Side
 
 FPS = 30.0
-# A hand touches where its nearest vertex is no farther than this, metres.
+# A hand touches the object if its nearest vertex is no farther than this, metres.
 CONTACT = 0.003
 _SENSOR_NOISE = 1.3 / 255
-# A point counts as seen where it is no farther behind the visible surface than this, metres.
+# A point is visible if it is no farther behind the visible surface than this, metres.
 _SEEN_WITHIN = 0.003
 _SEEN_FRAMES = 3
 
@@ -118,7 +118,7 @@ def make_clip(
         normalize_shift=shift,
         hands={side: _hand_track(hand_models[side], guess, shift) for side, guess in hand_guesses.items()},
         object=object_track,
-        # torch pickles the tensor's address; without it the files are the same bytes every time.
+        # torch pickles the tensor's address; without it the files have the same bytes every time.
         torch_norm_mat=False,
     )
     arrays: dict[str, Any] = {"K": K, "wh": np.array([width, height]), "fps": FPS}
@@ -227,7 +227,7 @@ def _seen_fingers(
         [_seen(v, K, picture, MASK_VALUES[side]) for v, picture in zip(motion.verts, pictures, strict=True)],
         axis=0,
     )
-    # Half of a finger always faces away.
+    # Half of a finger always faces away from the camera.
     return np.array([min(1.0, 2 * seen[np.isin(owner, finger)].mean()) for finger in FINGERS.values()])
 
 

@@ -15,11 +15,11 @@ from bigs.data.synthetic.grasp import FINGERS, HandLike, bend_axes, pose_hand, r
 from bigs.data.synthetic.motion import HandMotion, smooth_noise
 from bigs.data.tracks import fill_rotations, fill_vectors
 
-# Radians before scaling: constant over the clip, slow, and from frame to frame.
+# Radians before scaling: constant over the clip, slow, and per frame.
 _FINGER_ERROR = (0.16, 0.15, 0.05)
 _WRIST_ERROR = (0.10, 0.09, 0.03)
 _SIDEWAYS_BEND = 0.35  # errors across the flexion axis, relative to those along it
-_GROSS_ERROR = 0.6  # radians, in the few frames a regressor gets badly wrong
+_GROSS_ERROR = 0.6  # radians, in the few grossly wrong frames
 _JOINT_ERROR = (0.0205, 0.0265)  # metres, mean over frames and joints, root-aligned
 _DEPTH_ERROR = (0.032, 0.055)  # metres, root mean square
 _SIDE_ERROR = (0.011, 0.018)
@@ -43,7 +43,7 @@ class HandGuess:
 class ObjectGuess:
     """The object as structure from motion would give it: x_cam = rotations (scale X) + transl."""
 
-    points: np.ndarray  # [N, 3] X, in a frame and unit of its own
+    points: np.ndarray  # [N, 3] X, in its own frame and unit
     outliers: np.ndarray  # [N] bool
     scale: float  # metres per unit, estimated
     rotations: np.ndarray  # [T, 3, 3]

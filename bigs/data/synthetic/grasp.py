@@ -19,14 +19,14 @@ FINGERS: dict[str, tuple[int, int, int]] = {
     "ring": (10, 11, 12),
     "pinky": (7, 8, 9),
 }
-# How far knuckles bend at most, radians.
+# Largest bend of the knuckles, radians.
 _MAX_BEND = np.array([1.45, 1.65, 1.1])
-# Skin gives way by about this much; it is also how deep a finger may end up in the object. Metres.
+# Skin gives way by about this much, metres; fingers may go this deep into the object.
 PRESS = 0.0007
 # A MANO hand lies palm down.
 _PALM = np.array([0.0, -1.0, 0.0])
 _STEPS = 16
-# The joints whose vertices meet the object first when a flat hand is pressed to it.
+# The joints whose vertices touch first when a flat hand is pressed to the object.
 _PALM_SIDE = (0, 1, 4, 7, 10, 13)
 
 
@@ -164,7 +164,7 @@ class _Search:
         for moving in (joints, joints[1:], joints[2:]):
             step = np.zeros((15, 3))
             rows = np.array(moving) - 1
-            # What is left of each joint's range.
+            # The remaining range of each joint.
             step[rows] = bend[rows] - fingers[rows]
             fingers = fingers + self.largest_safe(fingers, step, wrist, moving) * step
         return fingers
@@ -207,7 +207,7 @@ class _Search:
                 trial = trial + self.largest_safe(trial, part, wrist, tuple(moving + 1)) * part
             gap = self.nearest(trial[None], wrist, FINGERS["thumb"])[0]
             tip = self.nearest(trial[None], wrist, FINGERS["thumb"][2:])[0]
-            # A thumb that starts inside the object is no grasp; otherwise the closest tip wins.
+            # A thumb that starts inside the object is no grasp; otherwise the closest fingertip wins.
             score = abs(tip) + 10 * max(0.0, -PRESS - min(gap, start)) + 0.004 * share
             if score < best_score:
                 best, best_score = trial, score

@@ -12,12 +12,12 @@ from bigs.data.synthetic.grasp import FINGERS, Grasp, HandLike, bend_axes, pose_
 
 # Camera axes: y points down, so up is its negative.
 _UP = np.array([0.0, -1.0, 0.0])
-# The smallest rotation must show the object from all around, or structure from motion has no back side.
+# The rotation must show the object from all around, or structure from motion has no back side.
 _TURN_DEGREES = (195.0, 250.0)
 _DISTANCE = (0.52, 0.66)
-# Part of the half image that bodies may fill.
+# Share of the half image that bodies may fill.
 _FILL = 0.92
-# How far a finger lifts off now and then, radians; hands that hold something are never quite still.
+# How far a finger lifts now and then, radians; holding hands are never quite still.
 _LIFT = 0.05
 
 

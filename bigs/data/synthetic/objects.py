@@ -22,7 +22,7 @@ OBJECT_KINDS: tuple[ObjectKind, ...] = ("bottle", "box", "tool")
 
 PointFunction = Callable[[np.ndarray], np.ndarray]
 
-# Cell of the grid the mesh is cut from: finer than the smallest rounding (3 mm).
+# Cell size of the grid from which the mesh is cut: finer than the smallest rounding (3 mm).
 _MESH_CELL = 0.0025
 
 
@@ -32,7 +32,7 @@ class Hold:
 
     point: tuple[float, float, float]  # the palm is pressed to the surface along a line through this point
     normal: tuple[float, float, float]  # from the object to the palm
-    thumb: tuple[float, float, float]  # where the thumb's side of the palm points; at right angles to normal
+    thumb: tuple[float, float, float]  # where the thumb's side of the palm points; orthogonal to normal
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ _BOTTLE_PROFILE = np.array(
         [0.032, 0.06], [0.018, 0.072], [0.016, 0.08], [0.0205, 0.0805], [0.0195, 0.104], [0.0, 0.105],
     ]
 )  # fmt: skip
-# The bottle is oval, so that its rotation about its own axis changes its outline as well.
+# The bottle is oval, so that rotation about its axis also changes its outline.
 _BOTTLE_OVAL = 0.78
 
 
@@ -116,7 +116,7 @@ def _bottle_distance(points: np.ndarray) -> np.ndarray:
     x, y, z = points[:, 0], points[:, 1] / _BOTTLE_OVAL, points[:, 2]
     radius = np.maximum(np.hypot(x, y), 1e-9)
     distance, slope = _revolved(radius, z, _BOTTLE_PROFILE)
-    # Squeezing y makes the function steeper than a distance; dividing by its slope puts that right.
+    # Squeezing y makes the function steeper than a distance; dividing by its slope corrects that.
     steepness = np.hypot(slope[:, 0] * np.hypot(x, y / _BOTTLE_OVAL) / radius, slope[:, 1])
     return distance / np.maximum(steepness, 0.5)
 

@@ -115,7 +115,7 @@ class _Rays:
             s, t = -(toward_c * moment).sum(1) / facing, (toward_b * moment).sum(1) / facing
         columns_per_row = columns.stop - columns.start
         row, column = rows.start + ray // columns_per_row, columns.start + ray % columns_per_row
-        # A triangle seen exactly edge on has no depth, and nothing to show.
+        # A triangle seen exactly edge on has no depth and is invisible.
         front = (facing != 0) & (z < self.depth[row, column])
         row, column, z = row[front], column[front], z[front]
         self.depth[row, column] = z
