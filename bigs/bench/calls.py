@@ -18,7 +18,7 @@ from bigs.raster import RasterSettings, rasterization
 Region = Literal["whole", "centre"]
 OURS = "bigs"
 
-# Between the first and the last of several cameras, metres.
+# Distance between the first and the last of several cameras, metres.
 _BASELINE = 0.06
 
 
@@ -31,11 +31,11 @@ class Task:
     dtype: Literal["float32", "float64"] = "float32"
     settings: RasterSettings = field(default_factory=RasterSettings)
     wanted: tuple[str, ...] = PARAMETERS  # gradients
-    rendered: Region = "whole"  # centre: the pixel mask keeps the middle quarter of the image
-    differentiated: Region = "whole"  # centre: no gradient comes in outside the middle quarter
-    views: int = 1  # cameras side by side
-    apart: bool = False  # render them one by one
-    unseen: float = 0.0  # Gaussians added that no pixel sees, as a part of those there are
+    rendered: Region = "whole"  # "centre": the pixel mask keeps the middle quarter of the image
+    differentiated: Region = "whole"  # "centre": no gradient comes from outside the middle quarter
+    views: int = 1  # number of cameras, side by side
+    apart: bool = False  # whether to render them one by one
+    unseen: float = 0.0  # invisible Gaussians to add, as a share of the scene's
 
 
 class Call:
@@ -52,7 +52,7 @@ class Call:
             name: torch.tensor(gaussians[name], dtype=dtype, requires_grad=name in task.wanted)
             for name in PARAMETERS
         }
-        # As far apart as a pair of eyes.
+        # The distance between a pair of eyes.
         self._viewmats = torch.tensor(workload.viewmat, dtype=dtype).repeat(task.views, 1, 1)
         self._viewmats[:, 0, 3] += torch.linspace(0, _BASELINE, task.views, dtype=dtype)
         self._K = torch.tensor(workload.K, dtype=dtype)

@@ -10,7 +10,7 @@ from typing import Any
 from bigs.bench.tables import gradient_error
 from bigs.checks import InputError
 
-# Errors below this are drawn on it: float64 against itself is 0, which a logarithmic axis has not.
+# Smaller errors are drawn here: a logarithmic axis cannot show float64's 0 against itself.
 _FLOOR = 1e-9
 _RULES = {"exact": "float64, default thresholds", "every_pair": "float64, no thresholds"}
 _COLORS = ("#1b6ca8", "#c8553d", "#5b8c5a", "#8e6c8a", "#b8860b")
@@ -45,7 +45,7 @@ def draw_curve(report: dict[str, Any]) -> bytes:
             _draw_settings(axis, workload["curve"], rule)
             _draw_peers(axis, workload, rule)
             axis.minorticks_off()
-            # Times of one workload may all lie between two powers of ten.
+            # All times of one workload may lie between two powers of ten.
             axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 3)))
             axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
             axis.grid(True, which="major", color="#dddddd", linewidth=0.6)

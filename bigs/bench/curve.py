@@ -7,8 +7,8 @@ from typing import Any
 
 from bigs.bench.calls import Task
 
-# What stands for a renderer without thresholds: every pair of which a float32 image could show anything. With
-# exactly 0 every Gaussian would cover every pixel.
+# Stands for a renderer without thresholds: every pair that could show in a float32 image. With exactly 0,
+# every Gaussian would cover every pixel.
 _FAINTEST = 1e-6
 
 
@@ -16,7 +16,7 @@ _FAINTEST = 1e-6
 class Point:
     """One choice of the settings."""
 
-    group: str  # what is traded; points of one group are joined in the picture
+    group: str  # the setting that varies; points of one group are joined in the picture
     label: str
     changes: tuple[tuple[str, Any], ...]  # of RasterSettings, or dtype
 

@@ -23,15 +23,15 @@ from bigs.bench.skips import SKIPS, Skip
 from bigs.bench.worker import Sample, Worker
 from bigs.bench.workloads import KINDS, WorkloadSpec, make_workload
 
-# Operations of a composited pair with three channels, a multiply-add being two.
-# Forward: offset 2, exponent 8, power of two by a polynomial of degree five 13, clamp and threshold 2, weight
-# and transmittance 3, colour 6, stop rule 1. Backward: offset, exponent, power and clamp again 25, weight and
-# transmittance 3, gradients of colour 6, alpha 11 and opacity 1, and five moments of the offset 11.
+# Operations per composited pair with three channels; a multiply-add counts as two. Forward: offset 2,
+# exponent 8, power of two by a polynomial of degree five 13, clamp and threshold 2, weight and transmittance
+# 3, colour 6, stop rule 1. Backward: offset, exponent, power and clamp again 25, weight and transmittance 3,
+# gradients of colour 6, alpha 11 and opacity 1, and five moments of the offset 11.
 FLOPS_FORWARD, FLOPS_BACKWARD = 35, 57
-# Pixels, and Gaussians for each gradient, that one of two rows of errors leaves out.
+# Number of worst pixels, and of worst Gaussians per gradient, left out in the second row of errors.
 _WORST = 100
 
-# Measurements of the peak, of which the largest counts: it belongs to the CPU, not to what else runs on it.
+# Measurements of the peak; the largest counts, since other load can only lower it.
 _PEAK_TRIES = 5
 
 
@@ -39,7 +39,7 @@ class Lane(NamedTuple):
     """A process to measure in."""
 
     threads: int = 1
-    level: str = ""  # a CPU feature level to lower the engine to; the best one if empty
+    level: str = ""  # CPU feature level for the engine; the best one if empty
 
 
 class Variant(NamedTuple):

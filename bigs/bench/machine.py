@@ -45,7 +45,7 @@ def peak_of(work: Callable[[], object]) -> float:
     Memory that earlier work left to the allocator does not show, so the process should be a new one.
     """
     try:
-        # Linux: writing 5 sets the recorded peak back to what is in use.
+        # Linux: writing 5 resets the recorded peak to current use.
         Path("/proc/self/clear_refs").write_text("5")
         before = _kilobytes(_STATUS, "VmRSS")
         work()
@@ -59,7 +59,7 @@ def peak_of(work: Callable[[], object]) -> float:
 def largest_so_far() -> float:
     """Bytes that this process held at its largest."""
     try:
-        # Linux's `ru_maxrss` also counts what the process that started this one held: exec keeps it.
+        # Linux's `ru_maxrss` survives exec, so it includes what the parent process held.
         return 1024.0 * _kilobytes(_STATUS, "VmHWM")
     except (OSError, StopIteration):
         pass

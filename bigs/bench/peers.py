@@ -16,7 +16,7 @@ import torch
 from bigs.bench.pairs import composited_in_tile
 from bigs.raster import RasterSettings
 
-# leaves by name, viewmat [4, 4], K [3, 3], width, height: the image [H, W, 3] and what else is known
+# leaves by name, viewmat [4, 4], K [3, 3], width, height -> image [H, W, 3] and extra information
 Render = Callable[[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, int, int], tuple[torch.Tensor, dict]]
 
 _TILE = 16
@@ -28,8 +28,8 @@ class Peer:
 
     package: str
     install: str
-    note: str  # what one has to know to read its numbers
-    bytes_per_pair: int  # memory it takes for each composited pair, to not start what cannot end
+    note: str  # note for readers of its numbers
+    bytes_per_pair: int  # memory per composited pair, so that hopeless runs are not started
     render: Render
 
 

@@ -20,7 +20,7 @@ class Plan:
     parts: tuple[str, ...] = PARTS
     peers: tuple[str, ...] = tuple(PEERS)
     repeats: int = 15
-    budget: float = 20.0  # seconds after which one variant of a workload is not called again
+    budget: float = 20.0  # seconds after which a variant of a workload is not called again
 
 
 def check_plan(plan: Plan) -> None:

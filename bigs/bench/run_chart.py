@@ -9,7 +9,7 @@ from typing import Any
 from bigs.bench.chart import check_drawing
 from bigs.bench.run_tables import finished, is_timed, mean, score
 
-# Heading, key, whether a score in percent is drawn as what is missing to 100.
+# Heading, key, and whether a score in percent is drawn as 100 minus it.
 _PANELS = (
     ("MPJPE, mm", "mpjpe_ra_h", False),
     ("wrists after one scale, mm", "wrist_h", False),
@@ -48,7 +48,7 @@ def draw_runs(report: dict[str, Any]) -> bytes:
             _draw_runs(axis, label, group, key, inverted, _COLORS[index % len(_COLORS)])
     for axis in axes[3:]:
         axis.set_xlabel("wall time of a run, s", fontsize=8)
-    # Any panel may lack a score, so the legend takes what any of them has.
+    # Any panel may lack a score, so the legend collects from all.
     named = {
         label: handle
         for axis in axes

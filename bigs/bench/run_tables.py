@@ -10,8 +10,8 @@ from bigs.bench.page import Rows, Table
 
 Run = dict[str, Any]
 
-# What a table of runs shows of the scores: heading, key, digits. A key that ends in _h is the mean of both
-# hands; a clip with one hand has that hand's.
+# Scores in a table of runs: heading, key, digits. A key that ends in _h is the mean of both hands, or the
+# only hand's.
 SCORES: tuple[tuple[str, str, int], ...] = (
     ("MPJPE mm", "mpjpe_ra_h", 2),
     ("wrist mm", "wrist_h", 2),
@@ -23,7 +23,7 @@ SCORES: tuple[tuple[str, str, int], ...] = (
     ("PSNR dB", "psnr_foreground", 2),
 )
 INITIAL = "initial estimates"
-# Below this share of the fields' time in the stage where they cost most, a stage evaluates none.
+# A stage that spends less than this share of the fields' largest time evaluates none.
 _NO_FIELDS = 0.02
 
 
@@ -41,7 +41,7 @@ def introduction(report: dict[str, Any]) -> str:
     )
 
 
-# What is printed; the page has all tables.
+# Printed on the terminal; the page has all tables.
 BRIEF = ("Time and errors", "Switches", "Failed or not timed")
 
 

@@ -19,9 +19,7 @@ class Skip:
     label: str
     with_it: Callable[[Task], Task]
     without_it: Callable[[Task], Task] = _same
-    work: float = (
-        1.0  # how much more there was to leave out on the "with" side, as a factor on the time without
-    )
+    work: float = 1.0  # factor on the time without: how much more work the "with" side could skip
 
 
 SKIPS: tuple[Skip, ...] = (
@@ -38,6 +36,6 @@ SKIPS: tuple[Skip, ...] = (
         lambda base: replace(base, views=8),
         lambda base: replace(base, views=8, apart=True),
     ),
-    # Without culling each Gaussian would cost what a seen one does; that can be computed but not switched on.
+    # Culling cannot be switched off; its gain is computed as if each Gaussian cost as much as a seen one.
     Skip("as many Gaussians again, unseen", lambda base: replace(base, unseen=1.0), work=2.0),
 )

@@ -9,9 +9,9 @@ from bigs.bench.engine import FLOPS_BACKWARD, FLOPS_FORWARD
 from bigs.bench.errors import COLUMNS
 from bigs.bench.page import Rows, Table, page
 
-# Columns of the plain times.
+# Columns of the table of times.
 _SUMS = ("forward_cpu", "backward_cpu", "cpu", "fastest_cpu", "wall", "fastest_wall")
-# What `_raster.time_engine` calls its stages.
+# Stage names of `_raster.time_engine`.
 _STAGES = ("project", "bin", "composite", "composite vjp", "project vjp")
 
 

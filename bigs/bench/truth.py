@@ -8,7 +8,7 @@ import numpy as np
 
 from bigs.bench.workloads import PARAMETERS, WorkloadSpec, folder_module
 
-# Workloads with more Gaussians than this take their reference minutes; it is used where it lies in a file.
+# The reference of larger workloads takes minutes; it is used only if it lies in a file.
 _QUICK = 10_000
 
 

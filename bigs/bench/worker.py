@@ -24,7 +24,7 @@ from bigs.bench.workloads import WorkloadSpec
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# A turn of one variant lasts about this long, milliseconds.
+# A turn of one variant lasts about this many milliseconds.
 _TURN = 40.0
 
 
@@ -78,7 +78,7 @@ def _environment(changes: Mapping[str, str]) -> Iterator[None]:
 _peer_results: dict[Task, dict[str, np.ndarray]] = {}
 
 
-# A workload has fewer variants than this; those of the one before it go.
+# A workload has fewer variants than this, so those of the previous one are dropped.
 @lru_cache(maxsize=64)
 def _call(task: Task) -> Call:
     return Call(task)
@@ -93,7 +93,7 @@ def sample(task: Task) -> Sample:
     call = _call(task)
     first, result = _timed(call)
     if task.renderer != OURS:
-        # A peer may take minutes: its errors are those of a run that was timed.
+        # A peer may take minutes, so its errors come from a timed run.
         _peer_results[task] = result
     if first.wall > _TURN:
         return first
@@ -147,7 +147,7 @@ def _fresh_result(task: Task) -> dict[str, np.ndarray]:
     return {"image": image.detach().numpy(), **call.backward(image)}
 
 
-# The truth of a workload by each of the two rules it is held against.
+# The reference of a workload under both rules.
 @lru_cache(maxsize=2)
 def _result(task: Task) -> dict[str, np.ndarray]:
     return _fresh_result(task)
@@ -161,7 +161,7 @@ def engine_times(task: Task) -> list[tuple[str, float]]:
 def peak_memory(task: Task) -> float:
     """Bytes that a forward and a backward pass take at their peak, in a worker that has done nothing yet."""
     call = _call(task)
-    # What the first call of a process loads and starts belongs to no workload.
+    # The first call in a process loads and starts things, which belongs to no workload.
     smallest = Call(replace(task, workload=WorkloadSpec(task.workload.name, scale=1e-9)))
     smallest.backward(smallest.forward())
     return peak_of(lambda: call.backward(call.forward()))

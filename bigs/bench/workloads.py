@@ -15,10 +15,10 @@ import numpy as np
 
 from bigs.checks import InputError, check_choice
 
-# Names of the differentiable arrays, in the order the renderers take them.
+# Names of the differentiable arrays in the renderers' order.
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
-# A folder with a `workloads.py` whose make_workload(name) takes the place of the generators below.
+# A folder with a `workloads.py` whose make_workload(name) replaces the generators below.
 FOLDER_VARIABLE = "BIGS_BENCH"
 
 _SMALLEST_IMAGE = 16
@@ -31,8 +31,8 @@ class WorkloadSpec:
 
     name: str  # one of KINDS
     seed: int = 0
-    scale: float = 1.0  # of the number of Gaussians and of pixels
-    folder: str | None = None  # with workloads of its own; seed and scale do not touch them
+    scale: float = 1.0  # factor on the number of Gaussians and of pixels
+    folder: str | None = None  # folder with its own workloads, which ignore seed and scale
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Kind:
 
     text: str
     gaussians: int
-    size: int  # of the square image, pixels
+    size: int  # side of the square image, pixels
     make: Callable[[np.random.Generator, int, int], dict[str, np.ndarray]]
 
 
@@ -99,7 +99,7 @@ def make_workload(spec: WorkloadSpec) -> Workload:
     size = max(_SMALLEST_IMAGE, round(kind.size * math.sqrt(spec.scale)))
     random = np.random.default_rng([spec.seed, *spec.name.encode()])
     gaussians = kind.make(random, n, size)
-    order = random.permutation(n)  # an index says nothing about a place
+    order = random.permutation(n)  # the order says nothing about positions
     gaussians = {name: np.ascontiguousarray(gaussians[name][order], np.float32) for name in PARAMETERS}
     focal = 1.2 * size
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], np.float32)
@@ -123,7 +123,7 @@ def _quats_of_normals(random: np.random.Generator, normals: np.ndarray) -> np.nd
     """Rotations w x y z that take the z axis to a normal, spun about it by any angle; [n, 4]."""
     half = random.uniform(0, math.pi, len(normals))
     spin = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
-    # The shortest arc from z: (1 + n·z, z × n); where n is -z that is zero, and half a turn about x will do.
+    # The shortest arc from z: (1 + n·z, z × n). Where n is -z that is zero, so half a turn about x is used.
     x, y, z = normals.T
     arc = np.stack([1 + z, -y, x, 0 * z], axis=-1)
     arc[np.linalg.norm(arc, axis=-1) < 1e-6] = (0, 1, 0, 0)

@@ -33,12 +33,12 @@ class Extra(NamedTuple):
     enables: str
 
 
-# The modules of the packages that pyproject.toml demands; a test compares.
+# Modules of the packages that pyproject.toml requires; a test compares them.
 REQUIRED = (
     *("numpy", "torch", "kornia", "trimesh", "pycolmap", "scipy", "rtree"),
     *("skimage", "PIL", "safetensors", "tyro", "rich", "yaml"),
 )
-# The extras of pyproject.toml; a test compares.
+# The extras of pyproject.toml; a test compares them.
 EXTRAS: dict[str, Extra] = {
     "video": Extra(("av",), "preview.mp4, and videos as input of bigs preprocess"),
     "synthetic": Extra(("embreex",), "bigs demo and every generated clip"),
@@ -53,13 +53,13 @@ EXTRAS: dict[str, Extra] = {
     "browser": Extra(("playwright",), "the tests of the viewer and the report in a browser"),
     "dev": Extra(("maturin", "pytest", "xdist", "hypothesis"), "building and testing bigs itself"),
 }
-# Environment variables that name data, and what that is for.
+# Environment variables that name data, and their use.
 VARIABLES = {
     "BIGS_BENCH": "other workloads for bigs bench engine",
     "BIGS_CLIPS": "real clips for the tests",
     "BIGS_HAND_MODEL": "hand models for the tests",
 }
-# The distribution that a module comes with, where its name differs.
+# Distribution of a module, if its name differs.
 DISTRIBUTIONS = {
     "skimage": "scikit-image",
     "PIL": "pillow",
@@ -121,7 +121,7 @@ def _outside() -> Iterator[Finding]:
     if importlib.util.find_spec("torchvision") is not None:
         try:
             importlib.import_module("torchvision")
-        except Exception as error:  # its binary part raises what it likes
+        except Exception as error:  # its binary part may raise anything
             yield Finding(
                 "torchvision",
                 "broken",

@@ -104,7 +104,7 @@ class _RunBar:
         return self._cost.get(stage.name, 0) * int(getattr(stage, "steps", 0))
 
     def listen(self, event: dict[str, Any]) -> None:
-        # Not before something happens: bad input is answered by one sentence and nothing else.
+        # Only once something happens: bad input is answered by one sentence and nothing else.
         self._progress.start()
         if event["event"] == "stage":
             self._done = sum(map(self._work, self._stages[: event["index"]]))

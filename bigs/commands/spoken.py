@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
-# Seconds after which a line says where it is, though nothing new has begun.
+# Seconds after which progress is printed, even if nothing new has begun.
 PATIENCE = 30.0
-# In "step 12/300" or "30 frames" the words say what is done, the numbers how far it is.
+# In "step 12/300" or "30 frames", words say what is done and numbers how far it is.
 _COUNT = re.compile(r"\d+")
 
 

@@ -72,9 +72,7 @@ class Clip:
         np.ndarray
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files, for every entity
-    annotated: bool = (
-        False  # whether the tracks are a data set's ground truth, from which no reconstruction may start
-    )
+    annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 

@@ -34,9 +34,7 @@ _DILATIONS = (5, 7, 9, 11)
 class PiDiNet:
     """The network; called with pictures it returns their edges."""
 
-    weights: dict[
-        str, Tensor
-    ]  # by their published names; difference kernels have been turned into ordinary ones
+    weights: dict[str, Tensor]  # by their published names; difference kernels are ordinary ones here
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ class FreeGaussians(nn.Module):
         self.register_buffer("opacity_logits", torch.zeros(count))
         self.register_buffer("color_logits", torch.zeros(count, 3))
         self.register_buffer("normals", torch.zeros(count, 3))
-        # Along the normal, metres: along the surface others are there already.
+        # Along the normal, metres: along the surface there are Gaussians already.
         self.shift = nn.Parameter(torch.zeros(count))
         self.size = nn.Parameter(torch.zeros(count, 3))  # logarithmic
         self.opacity = nn.Parameter(torch.zeros(count))  # logit

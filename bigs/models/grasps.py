@@ -27,9 +27,9 @@ class Grasps(nn.Module):
         super().__init__()
         self.mirrored = mirrored
         self.register_buffer("of_frame", torch.full((n_frames,), -1))
-        # How sure it is that a frame belongs to its grasp; 0 where there is none.
+        # Certainty that a frame belongs to its grasp; 0 outside grasps.
         self.register_buffer("certainty", torch.zeros(n_frames))
-        # What a frame of a grasp may add of its own: the factor on its residuals.
+        # Factor on the residuals that a frame of a grasp adds to it.
         self.register_buffer("slack", torch.zeros(()))
         self.register_buffer("base_orient", torch.eye(3).repeat(n_frames, 1, 1))
         self.register_buffer("base_pose", torch.eye(3).repeat(n_frames, 15, 1, 1))

@@ -33,15 +33,15 @@ class HandSplatsConfig:
     shared: bool = True
     # Standard deviation of an estimate of betas that no second hand confirms; 0 trusts it entirely.
     shape_error: float = 0.6
-    # Let the geometry field move, turn and scale the Gaussians. The released code freezes them.
+    # Let the geometry field offset, rotate and scale the Gaussians. The released code freezes them.
     learn_geometry: bool = True
-    # Standard deviations at the start: along the surface in units of the local spacing, across it in units
-    # of the former.
+    # Standard deviations at the start: along the surface in units of the local spacing, across it relative to
+    # that.
     scale_per_spacing: float = 0.55
     flatness: float = 0.35
     opacity: float = 0.95
     max_offset: float = 0.003
-    # The mean colour of skin under white light is only the start; a stage may begin from the images' own.
+    # The mean colour of skin under white light; only a start, since a stage may take the images' own.
     color: tuple[float, float, float] = (0.7, 0.55, 0.45)
 
 
@@ -85,7 +85,7 @@ class HandSplats(nn.Module):
         spacing = point_spacing(points)
         sigma = config.scale_per_spacing * spacing
         as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
-        # The soft silhouette of a Gaussian on the surface reaches past it; the centres go in by as much.
+        # A Gaussian on the surface reaches past the silhouette, so its centre is moved inwards by as much.
         inset = config.flatness * sigma[:, None] * normals
         self.register_buffer("base_points", as_tensor(points - inset), persistent=False)
         self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)

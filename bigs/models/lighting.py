@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from bigs.types import Entity, Gaussians
 
-# A hand has 16 bones; an object is given as many regions.
+# A hand has 16 bones, and an object gets as many regions.
 N_PARTS = 16
 
 
@@ -31,7 +31,7 @@ class Lighting(nn.Module):
     def __init__(self, entities: Iterable[Entity], n_frames: int) -> None:
         super().__init__()
         self.clip = nn.Parameter(torch.zeros(8, 3))
-        # Constant, slope along x, y, z, and parts: brightness only, shade has no colour of its own.
+        # Constant, slopes along x, y, z, and parts. Brightness only: shade has no colour.
         self.shade = nn.ParameterDict(
             {entity: nn.Parameter(torch.zeros(n_frames, 4 + N_PARTS)) for entity in entities}
         )

@@ -86,13 +86,13 @@ class Moments:
         if entity == "object":
             posed = pose_object(canonical, self.object)
             if lighting is not None:
-                # One matrix product instead of a formula in each frame's quaternions.
+                # One matrix product instead of a formula per frame.
                 normals = third_axis(canonical.quats) @ self.object.rotations.transpose(-1, -2)
         else:
             posed = self.posed_hand(entity, canonical)
         if lighting is None:
             return posed
-        # Light has no say in how a hand bends.
+        # Light does not change how a hand bends.
         return lighting(entity, posed, self.frames, canonical.weights.detach(), normals)
 
     def posed_hand(self, side: Side, hand: CanonicalHand) -> Gaussians:

@@ -11,7 +11,7 @@ from bigs.models.free_gaussians import FreeGaussians
 from bigs.models.lighting import N_PARTS
 from bigs.models.object_splats import CanonicalObject
 
-# Neighbours at a distance of one over this many standard deviations cover a surface evenly.
+# Neighbours this many standard deviations apart cover a surface evenly.
 _SIGMA_PER_SPACING = 0.6
 
 

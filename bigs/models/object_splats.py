@@ -30,7 +30,7 @@ class ObjectSplatsConfig:
     flatness: float = 0.35
     opacity: float = 0.95
     max_offset: float = 0.006
-    # One scale for all three axes, as the released code has it; the paper's Eq. 1 has three.
+    # One scale for all three axes, as in the released code; the paper's Eq. 1 has three.
     isotropic: bool = False
 
 
@@ -122,7 +122,7 @@ def region_weights(points: np.ndarray, normals: np.ndarray, count: int) -> np.nd
 
     A region has a side: its width in metres is also how far apart opposite unit normals [N, 3] count.
     """
-    # A region's share of the surface, were the points on a sphere as large.
+    # A region's share of the surface if the points lay on a sphere.
     width = 2.0 * float(np.sqrt(points.var(0).sum() * 4.0 / count))
     places = np.concatenate([points, width * normals], axis=1)
     anchors = [int(np.argmin(((places - places.mean(0)) ** 2).sum(1)))]
@@ -131,7 +131,7 @@ def region_weights(points: np.ndarray, normals: np.ndarray, count: int) -> np.nd
         nearest = np.minimum(nearest, ((places - places[anchors[-1]]) ** 2).sum(1))
         anchors.append(int(nearest.argmax()))
     squared = ((places[:, None] - places[anchors]) ** 2).sum(-1)
-    # Relative to the nearest anchor, so that a point far from all still belongs to one.
+    # Relative to the nearest anchor, so that distant points still belong to one.
     share = np.exp((squared.min(1, keepdims=True) - squared) / (2.0 * (0.5 * width) ** 2))
     return share / share.sum(1, keepdims=True)
 

@@ -23,7 +23,7 @@ from bigs.models.scene import Scene, concatenate
 from bigs.names import check_name
 from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 
-# What has a value for each frame.
+# Fields with a value per frame.
 _MOVING_HAND = (
     *("joints", "verts", "bones", "hand_pose", "shade"),
     *("global_orient_aa", "hand_pose_aa", "transl"),
@@ -58,12 +58,12 @@ class HandPlayback:
     transl: Tensor  # [T, 3] metres
     betas: Tensor  # [10]
     v_posed: Tensor  # [V, 3] or [T, V, 3]: shape and pose correctives, not skinned
-    # What it takes to pose the mesh anew (see `repose`), of the canonical hand as `bones` are.
+    # What is needed to pose the mesh again (see `repose`), of the canonical hand as `bones` are.
     lbs_weights: Tensor  # [V, 16]
     rest_joints: Tensor  # [16, 3] in the clip's shape
     tip_vertex_ids: Tensor  # [5] thumb, index, middle, ring, pinky
     grasp: Tensor  # [T] number of the grasp in which the object carries the hand, -1 for none
-    grasp_certainty: Tensor  # [T] in [0, 1] how sure that is; 0 where there is none
+    grasp_certainty: Tensor  # [T] in [0, 1], certainty of the grasp; 0 outside grasps
 
     def grasps(self) -> list[Grasp]:
         """The grasps, in order."""

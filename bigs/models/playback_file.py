@@ -33,7 +33,7 @@ from bigs.names import check_name
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-scene-4"
-# The same without a checksum and without grasps.
+# The previous format, without a checksum and grasps.
 _UNSUMMED = "bigs-scene-3"
 # No camera has more pixels on a side.
 _MOST_PIXELS = 1 << 16
@@ -62,9 +62,10 @@ def save_playback(path: Path, playback: Playback) -> None:
         "normalize_shift": playback.normalize_shift,
     }
     facts = {"format": FORMAT, **facts}
-    # One key: the writer's order of keys differs from run to run, and files shall not.
+    # A single key, since the writer's order of keys differs from run to run.
     metadata = {"bigs": json.dumps({**facts, "checksum": checksum(json.dumps(facts), tensors)})}
-    # Shared storage (one canonical hand for two sides) is written twice: a reader then needs no special case.
+    # Shared storage (one canonical hand for two sides) is written twice, so that readers need no special
+    # case.
     with atomic_write(path) as file:
         file.write(save({key: value.contiguous().clone() for key, value in tensors.items()}, metadata))
 
@@ -80,7 +81,7 @@ def load_playback(path: Path) -> Playback:
         with safe_open(path, framework="pt") as file:
             text = (file.metadata() or {}).get("bigs", "{}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except Exception as error:  # the reader raises its own, and torch's of types that it does not know
+    except Exception as error:  # safetensors raises its own errors, and torch's for unknown types
         raise InputError(f"{path}: expected a scene file, found a damaged one ({error})") from error
     facts = parse_json(f"{path}: metadata", text)
     if not isinstance(facts, dict):

@@ -88,15 +88,15 @@ class HandPoses(nn.Module):
         frames = global_orient.shape[0]
         self.register_buffer("base_orient", global_orient)
         self.register_buffer("base_pose", hand_pose)
-        # What was known before any image was looked at; `base_pose` moves on.
+        # The initial pose; `base_pose` changes during training.
         self.register_buffer("estimated_pose", hand_pose.clone())
         self.register_buffer("estimated_log_depth", wrist[:, 2].log())
-        # What logarithmic depth to expect of a frame, and of which frames anything is to be expected.
+        # Expected logarithmic depth of a frame, and which frames have one.
         self.register_buffer("expected_log_depth", torch.zeros(frames))
         self.register_buffer("has_expected_depth", torch.zeros(frames, dtype=torch.bool))
         self.orient = nn.Parameter(torch.zeros(frames, 3))
         self.pose = nn.Parameter(torch.zeros(frames, 15, 3))
-        # What a per-frame regressor gets wrong in every frame alike.
+        # Constant error of a per-frame regressor.
         self.pose_bias = nn.Parameter(torch.zeros(15, 3))
         self.position = RayPositions(wrist)
 
@@ -137,11 +137,11 @@ class HandPoses(nn.Module):
 class PoseErrors(NamedTuple):
     """How far an object's start poses are off, one standard deviation, by frame."""
 
-    turn: Tensor  # [T, 3, 3] a square root of the turns' covariance, radians, camera axes
-    ray: Tensor  # [T] of the place on the z = 1 plane
+    turn: Tensor  # [T, 3, 3] square root of the rotations' covariance, radians, camera axes
+    ray: Tensor  # [T] standard deviation of the position on the z = 1 plane
 
 
-# How far an estimate that nobody measured may be off: learning rates were chosen for it.
+# Typical error of an unmeasured estimate, for which the learning rates were chosen.
 USUAL_TURN = 0.025  # radians
 USUAL_RAY = 0.006
 
@@ -172,10 +172,10 @@ class ObjectPoses(nn.Module):
             size = torch.linalg.matrix_norm(errors.turn, ord=2)[:, None, None]
             turn = errors.turn / size.clamp_min(USUAL_TURN)
             ray = (errors.ray / USUAL_RAY).clamp(max=1.0)
-        # What residuals are multiplied by: never more than 1.
+        # Factors on the residuals, at most 1.
         self.register_buffer("turn_freedom", turn)
         self.register_buffer("ray_freedom", ray)
-        # Whether the start was measured, so that a prior holds its rays, too.
+        # Whether the start was measured, so that a prior also holds its rays.
         self.register_buffer("measured", torch.tensor(float(errors is not None)))
 
     def forward(self, frames: Tensor) -> ObjectFrames:

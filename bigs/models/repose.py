@@ -15,7 +15,7 @@ from bigs.hand.lbs import forward_kinematics
 from bigs.models.playback import HandPlayback, ObjectPlayback
 from bigs.types import Side
 
-# The three joints of each finger within `hand_pose`, from the knuckle out.
+# The three joints of each finger within `hand_pose`, from the knuckle outwards.
 FINGERS: dict[str, tuple[int, ...]] = {
     finger: tuple(JOINT_NAMES.index(f"{finger}{i}") - 1 for i in (1, 2, 3))
     for finger in ("thumb", "index", "middle", "ring", "pinky")
@@ -61,9 +61,9 @@ def repose(
     if left:
         verts, joints = mirror_points(verts), mirror_points(joints)
         orient, fingers, before = map(mirror_axis_angle, (orient, fingers, before))
-    # Rest joints are the right hand's; the wrist's own offset is what `transl` adds to its place at rest.
+    # Rest joints are the right hand's; `transl` is the wrist's place less its place at rest.
     transl = joints[:, 0] - (mirror_points(hand.rest_joints[0]) if left else hand.rest_joints[0])
-    # The mean pose is what the stored vectors lack.
+    # Stored vectors are relative to the mean pose.
     return replace(
         hand,
         joints=joints,

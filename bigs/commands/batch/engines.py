@@ -18,11 +18,11 @@ from typing import Any, Protocol
 from bigs.checks import InputError
 from bigs.commands.batch.job import Job, run_job
 
-# Seconds between two looks at jobs of a scheduler that does not call back.
+# Seconds between polls of a scheduler.
 _POLL = 0.5
 
 
-# Longer notices of schedulers are not repeated.
+# Longer messages of schedulers are cut.
 _LONGEST_NOTICE = 60
 
 
@@ -44,7 +44,7 @@ class Processes:
     """One new process for each attempt, so that one that dies takes nothing with it."""
 
     def __init__(self) -> None:
-        # Not forked: torch's and the engine's threads do not survive that.
+        # Not forked: torch's and the engine's threads do not survive a fork.
         self._context = multiprocessing.get_context("spawn")
         self._running: dict[int, tuple[Any, Job]] = {}
 
@@ -139,7 +139,7 @@ class RayCluster:
         try:
             ray.init(
                 address=address,
-                # A running cluster has its own size.
+                # A running cluster decides its own size.
                 num_cpus=None if address else workers * threads,
                 include_dashboard=None if address else False,
                 log_to_driver=False,
@@ -147,7 +147,7 @@ class RayCluster:
             )
         except (ConnectionError, ValueError) as error:
             raise InputError(f"--ray-address {address}: expected a cluster, found: {error}") from None
-        # A worker that dies is told here, and the batch decides; Ray's own retries would not be counted.
+        # The batch decides about retries; Ray's own would not be counted.
         self._run = ray.remote(num_cpus=threads, max_retries=0)(run_job)
         self._running: dict[Any, Job] = {}
 

@@ -31,7 +31,7 @@ class Job:
 
     run: PlannedRun
     threads: int  # CPU threads
-    batch: str  # which call of the batch command; attempts are counted for each
+    batch: str  # number of the call of the batch command; attempts are counted per call
 
     @property
     def name(self) -> str:
@@ -50,7 +50,7 @@ class Status:
     started: str = ""  # of the last attempt
     seconds: float = 0.0  # of the last attempt
     error: str = ""
-    again: bool = True  # whether another attempt could end otherwise
+    again: bool = True  # whether another attempt could succeed
     scores: dict[str, float] = field(default_factory=dict)
 
 
@@ -132,6 +132,6 @@ def run_job(job: Job) -> None:
 
 
 def _limit_threads(threads: int) -> None:
-    # The engine reads its variable when it is first used in a process.
+    # The engine reads this variable on first use in a process.
     os.environ["RAYON_NUM_THREADS"] = str(threads)
     torch.set_num_threads(threads)

@@ -14,7 +14,7 @@ from bigs.files import MAX_TEXT_BYTES, MAX_YAML_BYTES, parse_json, parse_yaml, r
 from bigs.names import check_name, check_path
 
 SUFFIXES = (".yaml", ".yml", ".json", ".csv", ".txt")
-# What separates several values in a cell of a CSV file.
+# Separates several values in a cell of a CSV file.
 _SEPARATOR = ";"
 
 
@@ -23,7 +23,7 @@ class Entry:
     """One clip of a batch; None and () are what the batch has for all."""
 
     clip: Path
-    name: str = ""  # of its folder
+    name: str = ""  # name of the folder
     preset: str | None = None
     config: Path | None = None
     hand_model: Path | None = None
@@ -64,7 +64,7 @@ def _rows(path: Path, text: str) -> Sequence[Any]:
         return [line for line in lines if line]
     if kind == ".csv":
         table = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
-        # A row that is longer than the heading has its rest under None.
+        # csv puts surplus cells under None.
         return [{key or "more cells": cell for key, cell in row.items() if cell} for row in table]
     document = parse_json(str(path), text) if kind == ".json" else parse_yaml(str(path), text)
     defaults: Mapping[str, Any] = {}

@@ -26,7 +26,7 @@ from bigs.viewer.batch_page import PageRow, write_batch_page
 
 SUMMARY_TABLE, SUMMARY_TEXT, SUMMARY_PAGE = "summary.csv", "summary.md", "index.html"
 
-# The scores that the table shows, those of the paper's tables; the CSV file has all.
+# Scores in the table, those of the paper's tables; the CSV file has all.
 _SHOWN = ("mpjpe_ra_h", "cd_h_sq", "cd_icp_sq", "f10_icp", "psnr_foreground")
 
 
@@ -46,8 +46,8 @@ class BatchResult:
 
     table: list[tuple[str, ...]]  # the first row is the heading
     failed: dict[str, str]  # clip -> why
-    kept: int  # clips that were finished before
-    attempts: int  # that this call made
+    kept: int  # clips that were already finished
+    attempts: int  # attempts made by this call
 
 
 def plan_batch(
@@ -122,7 +122,7 @@ def run_batch(
 
 def _work(plan: BatchPlan, engine: Engine, waiting: deque[Job], at_once: int, listen: Listener) -> None:
     running = 0
-    # Counted here, too: a worker may die before it can.
+    # Also counted here, since a worker may die before it can.
     tries: Counter[str] = Counter()
     while waiting or running:
         while waiting and running < at_once:

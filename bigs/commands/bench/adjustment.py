@@ -22,7 +22,7 @@ from bigs.motion.bundle import Bundle, BundleConfig, adjust
 PAGE = "adjustment.md"
 NUMBERS = "adjustment.json"
 
-# A camera that looks at an object of ten centimetres from 70 cm.
+# A camera 70 cm from an object of ten centimetres.
 _K = np.array([[900.0, 0.0, 240.0], [0.0, 900.0, 180.0], [0.0, 0.0, 1.0]])
 _NOISE = 0.2  # pixels
 
@@ -33,7 +33,7 @@ class AdjustmentPlan:
 
     frames: tuple[int, ...] = (60, 300)
     points: tuple[int, ...] = (1000, 7000)
-    # How many consecutive frames see a point; 0 is all.
+    # Number of consecutive frames that see a point; 0 is all.
     seen: tuple[int, ...] = (0, 20)
     iterations: int = 15
     seed: int = 0
@@ -64,7 +64,7 @@ def bench_adjustment(
     runs = []
     for frames in plan.frames:
         for points in plan.points:
-            # Views longer than the clip are the same as all of it.
+            # A longer view than the clip is all of it.
             for seen in dict.fromkeys(min(n, frames) or frames for n in plan.seen):
                 listen(f"{frames} frames, {points} points, each seen in {seen}")
                 runs.append(_measure(frames, points, seen, plan))
@@ -114,7 +114,7 @@ def _measure(frames: int, points: int, seen: int, plan: AdjustmentPlan) -> dict[
     wall, cpu = time.perf_counter(), time.process_time()
     found = adjust(bundle, _K, config)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    # Steps tell the motion without regard to the object's frame.
+    # Steps between frames do not depend on the object's frame.
     between = [turned[1:] @ turned[:-1].transpose(0, 2, 1) for turned in (found.rotations, rotations)]
     error = Rotation.from_matrix(between[0] @ between[1].transpose(0, 2, 1)).magnitude()
     return {

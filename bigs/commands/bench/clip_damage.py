@@ -17,11 +17,11 @@ from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, Side
 
-# Errors of an outline are alike over about so many pixels.
+# Errors of an outline are correlated over about this many pixels.
 _OUTLINE_CELL = 24
-# A stray blob's radius lies between these, pixels.
+# Range of a stray blob's radius, pixels.
 _BLOB_RADII = (4.0, 10.0)
-# A gross error turns by so many degrees and shifts by so many metres.
+# A gross error turns by this many degrees and shifts by this many metres.
 _GROSS_TURN = (30.0, 90.0)
 _GROSS_SHIFT = (0.04, 0.12)
 
@@ -30,16 +30,16 @@ _GROSS_SHIFT = (0.04, 0.12)
 class ClipDamage:
     """What is wrong with a clip; zeros leave it as it is. Shares are of the frames."""
 
-    what: str  # in a few words
-    outline: float = 0.0  # pixels by which outlines lie too far in or out, at most
+    what: str  # short description
+    outline: float = 0.0  # largest shift of outlines in or out, pixels
     blobs: int = 0  # stray discs at each subject's outline, added or cut out
-    maskless: float = 0.0  # share without any mask
-    swapped: float = 0.0  # share in which right and left change labels
+    maskless: float = 0.0  # share of frames without any mask
+    swapped: float = 0.0  # share of frames in which right and left swap labels
     noise: float = 0.0  # standard deviation, grey levels
     jpeg: int = 0  # quality; 0 for none
-    exposure: float = 0.0  # how far the gain wavers about 1
-    outliers: float = 0.0  # share in which an estimate is grossly wrong, for each subject its own frames
-    focal: float = 1.0  # factor on the focal length that is told
+    exposure: float = 0.0  # variation of the gain about 1
+    outliers: float = 0.0  # share of frames with a grossly wrong estimate, drawn for each subject
+    focal: float = 1.0  # factor on the stated focal length
 
 
 DAMAGES: dict[str, ClipDamage] = {
@@ -185,7 +185,7 @@ def _with_outliers(clip: Clip, share: float, rng: np.random.Generator) -> Clip:
         hit, turns, shifts = _gross(len(clip), share, rng)
         middle = _middle(track)
         rotations = np.where(hit[:, None, None], turns.as_matrix() @ track.rotations, track.rotations)
-        # About its own middle: an estimate that is wrong is still where the mask is.
+        # About its own middle, so that a wrong estimate stays where the mask is.
         transl = track.transl + (track.rotations - rotations) @ middle + hit[:, None] * shifts
         return replace(track, rotations=rotations, transl=transl)
 

@@ -18,7 +18,7 @@ from bigs.train.plan.config import OptimizeStage, RunConfig
 from bigs.train.plan.length import planned_steps
 from bigs.types import Side
 
-# Factors on the number of Gaussians: a subdivision of the hand's mesh makes four of each.
+# Factors on the number of Gaussians: one subdivision of the hand's mesh multiplies them by four.
 _FACTORS_GAUSSIANS = {"1/4": -1, "1": 0, "4": 1}
 _FACTORS_SIZE = {"1/2": 0.5, "1": 1.0, "2": 2.0}
 
@@ -41,7 +41,7 @@ def probes(clip: Clip, config: RunConfig, frames: Iterable[int]) -> list[Probe]:
         found.append(Probe("Gaussians", label, len(clip), replace(config, hand=hand, object=obj)))
     long_side = max(clip.width, clip.height)
     for label, factor in _FACTORS_SIZE.items():
-        # Images are never made larger than they are.
+        # Images are never enlarged.
         stages = tuple(
             replace(stage, image_size=min(long_side, round(factor * (stage.image_size or long_side))))
             if isinstance(stage, OptimizeStage)

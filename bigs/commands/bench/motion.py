@@ -33,8 +33,8 @@ from bigs.types import MASK_VALUES
 PAGE = "motion.md"
 NUMBERS = "motion.json"
 
-# What is done to a clip: share of the frames whose pose is turned by `_GROSS`, and pixels by which every
-# other mask is too wide and the rest too narrow.
+# Damage of a clip: share of frames whose pose is turned by `_GROSS`, and pixels by which every other mask is
+# too wide and the rest too narrow.
 VARIANTS: dict[str, tuple[float, int]] = {
     "plain": (0.0, 0),
     "poses": (0.1, 0),

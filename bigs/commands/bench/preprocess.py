@@ -45,12 +45,12 @@ from bigs.types import HandObjectTrajectory, Side
 PAGE = "preprocess.md"
 NUMBERS = "preprocess.json"
 
-# Where the object's turn is off by more than this the frame is wrong and has to be flagged, degrees.
+# A frame whose rotation is off by more than this is wrong and should be flagged, degrees.
 WRONG = 6.0
-# A flagged frame that is off by less than this was flagged for nothing, degrees.
+# A flag on a frame that is off by less than this is a false alarm, degrees.
 RIGHT = 3.0
 
-# Scores of initial estimates, with their headings.
+# Scores of initial estimates and their headings.
 _SCORES = {
     "mpjpe_ra_r": "MPJPE_r mm",
     "mpjpe_ra_l": "MPJPE_l mm",
@@ -75,7 +75,7 @@ class PreprocessPlan:
     clips: tuple[Path, ...]
     variants: tuple[str, ...] = tuple(VARIANTS)
     hand_model: Path | None = None
-    seed: int = 0  # of the noise
+    seed: int = 0  # seed of the noise
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class ObjectErrors(NamedTuple):
     """The object's poses against the truth, after one similarity of its frame."""
 
     degrees: np.ndarray  # [T]
-    millimetres: np.ndarray  # [T] of its place, at the true size
-    size: float  # metric size over the true one
+    millimetres: np.ndarray  # [T] error of its position, at the true size
+    size: float  # estimated size over the true one
 
     def wrong(self) -> np.ndarray:
         """Frames [T] (bool) whose turn is off by more than `WRONG`."""
@@ -200,7 +200,7 @@ def object_errors(alignment: Alignment, rotations: np.ndarray, transl: np.ndarra
     between = found.transpose(0, 2, 1) @ rotations
     usual = robust_mean_rotation(torch.from_numpy(between)).numpy()
     degrees = np.degrees(Rotation.from_matrix(between @ usual.T).magnitude())
-    # The true frame's origin lies somewhere in the found one: transl = size_ratio (t + R o), robustly.
+    # The true frame's origin lies at some o of the estimated one: transl = size_ratio (t + R o), robustly.
     shift, ratio, weight = np.zeros(3), 1.0, np.ones(len(transl))
     for _ in range(20):
         columns = np.concatenate([alignment.object_transl[:, :, None], found], axis=2)

@@ -45,9 +45,9 @@ class RunPlan:
 
     clips: tuple[Path, ...]
     presets: tuple[str, ...] = ("fast",)
-    # Switches that are off, one run each, in the first preset; several joined by "+" are one run.
+    # Switches to turn off in the first preset, one run each; several joined by "+" are one run.
     without: tuple[str, ...] = ()
-    # A preset of more steps is run with about so many; 0 runs all.
+    # Presets with more steps are cut to about this many; 0 runs all.
     steps_limit: int = 0
     hand_model: Path | None = None
     # Growth of the first preset on the first clip: numbers of frames, and steps of each stage (0: none).
@@ -63,9 +63,9 @@ class Variant:
     folder: str
     preset: str
     off: tuple[str, ...]
-    whole: RunConfig  # what would be run without a limit on the steps
+    whole: RunConfig  # the configuration without the limit on steps
     config: RunConfig
-    unused: tuple[str, ...]  # switches that the plan has nothing of
+    unused: tuple[str, ...]  # switches that the plan does not contain
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ NUMBERS = "robustness.json"
 CLEAN = "clean"
 DAMAGED = "clips"
 
-# What the tables show, and which of it is an error that can be a multiple of the clean clip's.
+# Scores in the tables, and which of them are errors to compare with the clean clip's.
 _SCORES = (*SCORES, ("novel aligned dB", f"{NOVEL_SCALED}{ALIGNED}", 2))
 _ERRORS = tuple(key for _, key, _ in _SCORES if ALL_METRICS[key].better == "lower")
 
@@ -42,7 +42,7 @@ class RobustnessPlan:
     damages: tuple[str, ...] = tuple(DAMAGES)
     preset: str = "fast"
     hand_model: Path | None = None
-    seed: int = 0  # of what is drawn
+    seed: int = 0  # seed of the random damage
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def bench_robustness(
         if done.failure:
             row["failure"] = done.failure
         else:
-            # Pictures count as they should have been, not as the damaged clip has them.
+            # Compare with the clean pictures, not with the damaged ones.
             found = evaluate_run(run.folder, EvaluationPlan(run.ground_truth, path), listen)
             row |= {"scores": found.scores["result"], "seconds": done.times["wall"]}
         report["runs"].append(row)

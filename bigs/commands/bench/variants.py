@@ -18,7 +18,7 @@ from bigs.data.excerpt import to_and_fro
 from bigs.data.limited_view import limited_frames, object_directions
 from bigs.types import MASK_VALUES, SIDES, HandObjectTrajectory, Side
 
-# Standard deviation of the sensor noise that is added where a picture is changed, grey levels.
+# Standard deviation of the sensor noise that is added to changed pictures, grey levels.
 _SENSOR_NOISE = 1.3
 
 
@@ -30,18 +30,18 @@ class KeypointNoise:
     outliers: float = 0.0  # share of keypoints that lie 30 pixels away on average
     dropouts: float = 0.0  # share of keypoints without confidence
     missing: float = 0.0  # share of frames without a hand
-    swaps: float = 0.0  # share of frames in which right and left change places
+    swaps: float = 0.0  # share of frames in which right and left are swapped
 
 
 @dataclass(frozen=True)
 class Variant:
     """One way to make a clip harder."""
 
-    what: str  # in a few words
+    what: str  # short description
     frames: Callable[[Clip], np.ndarray] = lambda clip: np.arange(len(clip))
-    contrast: float = 1.0  # of the object about its mean colour
-    blur: float = 0.0  # standard deviation, pixels
-    jpeg: int = 0  # quality; 0 for none
+    contrast: float = 1.0  # factor on the object's contrast about its mean colour
+    blur: float = 0.0  # standard deviation of the blur, pixels
+    jpeg: int = 0  # JPEG quality; 0 for none
     hands: tuple[Side, ...] = SIDES
     focal_known: bool = True
     keypoints: KeypointNoise = field(default_factory=KeypointNoise)

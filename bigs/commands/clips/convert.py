@@ -33,11 +33,11 @@ View = Literal["full", "limited"]
 class ConvertPlan:
     """What to make of a clip."""
 
-    view: View = "full"  # limited: a quarter of the frames, that show the object from few sides
-    every: int = 1  # keep every so many-th frame
-    width: int = 0  # of the images; 0 keeps theirs
-    masks: Path | None = None  # label masks, named as the images; the clip's own if not given
-    from_truth: bool = False  # start from a data set's truth
+    view: View = "full"  # limited: a quarter of the frames that shows the object from few sides
+    every: int = 1  # keep every Nth frame
+    width: int = 0  # width of the images; 0 keeps theirs
+    masks: Path | None = None  # label masks named like the images; the clip's own by default
+    from_truth: bool = False  # start from a data set's ground truth
 
 
 def convert(

@@ -16,15 +16,15 @@ _PAPER = "paper"
 class RunInput(NamedTuple):
     """What a run was made from."""
 
-    data_set: str = ""  # ARCTIC or HO-3D; "" for anything else
-    told: str = ""  # as it stands behind the run's name
+    data_set: str = ""  # ARCTIC, HO-3D or "" for anything else
+    told: str = ""  # suffix of the run's name
 
 
 class PaperTable(NamedTuple):
     """A table of the paper."""
 
     title: str
-    ours: str  # the title where no run is of the paper's data
+    ours: str  # the title if no run is of the paper's data
     data_sets: tuple[str, ...]
     columns: dict[str, str]  # our key -> the heading, with the unit
     rows: dict[str, tuple[float | None, ...]]  # method -> figures in the columns' order

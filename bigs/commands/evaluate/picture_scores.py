@@ -47,14 +47,14 @@ def novel_scores(
         rows = []
         for view in views:
             viewmat, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (view.viewmat, view.K))
-            # A clip that grows and a camera that stays see what a clip that stays and a nearer camera see.
+            # A larger clip looks the same as a nearer camera.
             viewmat[:3, 3] /= size
             camera = (view.frame_index, viewmat, K, *view.size)
             image, labels = view.image() / 255.0, view.mask()
             color, _ = render_frame(playback, *camera)
             alone = {entity: render_frame(playback, *camera, [entity])[0] for entity in playback.entities}
             masks: dict[str, np.ndarray] = {entity: labels == value for entity, value in MASK_VALUES.items()}
-            # A subject that was not reconstructed shows nothing.
+            # A subject that was not reconstructed renders as nothing.
             renders: dict[str, np.ndarray] = {
                 entity: alone.get(entity, np.zeros_like(color)) for entity in MASK_VALUES
             }

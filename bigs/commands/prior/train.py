@@ -41,10 +41,10 @@ __all__ = ["PixelConfig", "PixelTrainingConfig", "TrainedPrior", "train_prior"]
 
 FORMAT = "bigs-pixel-state-1"
 _GAUSSIANS = 3000
-# Standard deviation of a Gaussian on the mesh, in spacings of its neighbours, and along the normal.
+# Standard deviation of a Gaussian on the mesh: along the surface in spacings, and along the normal.
 _SPREAD, _FLATNESS = 0.6, 0.35
-# Of so many meshes, in so many pictures of each, it is looked how well the network knows them; all but this
-# share of them is known so well.
+# How well the network knows its meshes is measured on this many meshes in this many pictures each; this share
+# is known at least so well.
 _ASKED_MESHES, _ASKED_VIEWS, _ASKED_SHARE = 200, 8, 0.95
 
 
@@ -162,7 +162,7 @@ def read_shape(file: Path, up: str) -> Shape:
     visual: Any = mesh.visual
     if isinstance(visual, trimesh.visual.TextureVisuals):
         visual = visual.to_color()
-        visual.mesh = mesh  # whose vertices it counts where there is no texture
+        visual.mesh = mesh  # counts a mesh's vertices if it has no texture
     return Shape(verts, np.asarray(mesh.faces), np.asarray(visual.vertex_colors)[:, :3] / 255.0)
 
 

@@ -141,7 +141,7 @@ def mesh_of(trajectory: HandObjectTrajectory, entity: Entity, frame: int) -> Mes
 
 
 def _truth(playback: Playback, truth: HandObjectTrajectory) -> Callable[[int], Mapping[str, Mesh]]:
-    # For each frame of the run the index of its truth: the names are matched, not the numbers.
+    # The index of the ground truth for each frame of the run, matched by name.
     index = match_frames(truth.frame_names, playback.frame_names)
     entities: list[Entity] = [side for side in truth.verts if side in playback.entities]
     if truth.object_verts is not None and playback.object is not None:

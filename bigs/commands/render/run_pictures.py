@@ -25,9 +25,9 @@ from bigs.viewer.timeline import timeline
 
 # Degrees by which the novel view is turned about the scene.
 _NOVEL_VIEW = 40.0
-# So many frames lie under the report's slider, each of its three pictures so wide: two megabytes or so.
+# Number of frames under the report's slider, and width of each of the three pictures: about two megabytes.
 _SLIDER_FRAMES, _SLIDER_WIDTH = 60, 320
-# Below this share of its usual area in the masks the object counts as hidden.
+# The object counts as hidden below this share of its usual area in the masks.
 _HIDDEN = 0.1
 
 
@@ -39,7 +39,7 @@ class Told:
     per_frame: Mapping[str, np.ndarray]  # score -> [T]
     log: Sequence[Mapping[str, Any]]
     report: FitReport
-    times: Callable[[], Mapping[str, float]]  # seconds by part, asked for when all else is drawn
+    times: Callable[[], Mapping[str, float]]  # seconds by part, read when everything else is drawn
 
 
 def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> None:

@@ -23,9 +23,9 @@ from bigs.models.playback import Playback
 from bigs.types import Entity
 from bigs.viewer.preview import save_picture, to_bytes, write_video
 
-# Pictures of a turn that shows one moment: four seconds.
+# Pictures of an orbit of one frame: four seconds.
 TURN = 120
-# A millimetre's 16-bit numbers end here.
+# Largest 16-bit depth in millimetres.
 _FARTHEST_MM = 65535
 
 World = Literal["camera", "object"]
@@ -40,12 +40,12 @@ class Shot:
     cameras: Path | None = None
     orbit: bool = False
     from_input: bool = False
-    frame: int | None = None  # the time to show
-    play: bool = False  # a frame of the clip for each picture, again from the first after the last
-    about: About | None = None  # what the orbit turns about; the object if there is one
-    pictures: int | None = None  # how many the orbit has
-    size: tuple[int, int] | None = None  # width and height, for cameras that have none of their own
-    world: World | None = None  # what a file's cameras are placed in; the clip's camera frame if None
+    frame: int | None = None  # the frame to show
+    play: bool = False  # show the next frame of the clip in each picture, in a loop
+    about: About | None = None  # centre of the orbit; the object if there is one
+    pictures: int | None = None  # number of pictures of the orbit
+    size: tuple[int, int] | None = None  # width and height for cameras without a size
+    world: World | None = None  # frame of a file's cameras; the clip's camera frame if None
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Wanted:
     pictures: Path | None = None  # folder
     video: Path | None = None
     depth: DepthFormat | None = None
-    background: tuple[int, int, int] | None = None  # None: transparent pictures, a black video
+    background: tuple[int, int, int] | None = None  # None: transparent pictures, black in a video
 
 
 def render_run(

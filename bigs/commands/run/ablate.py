@@ -26,10 +26,10 @@ PAGE = "ablation.md"
 NUMBERS = "ablation.json"
 FULL = "full"
 
-# What the paper switches, in the order in which its table takes it away: L_SDS, L_contact, L_smt and sharing.
+# The paper's switches in the order in which its table removes them: L_SDS, L_contact, L_smt and sharing.
 INGREDIENTS = ("prior", "contact", "smooth", "share")
 _SCORES = ("cd_l_sq", "cd_r_sq", "cd_icp_sq", "f10_icp", "mpjpe_ra_l", "mpjpe_ra_r")
-# Table 3 of the paper (nine clips of ARCTIC): what is missing, and `_SCORES`.
+# Table 3 of the paper (nine clips of ARCTIC): what is left out, and `_SCORES`.
 _PAPER: dict[frozenset[str], tuple[float, ...]] = {
     frozenset(): (46.11, 31.28, 1.28, 83.93, 24.63, 24.35),
     frozenset(INGREDIENTS[:1]): (50.78, 35.57, 1.36, 81.78, 24.63, 24.35),
@@ -76,7 +76,7 @@ def parse_rows(names: Iterable[str]) -> list[Row]:
     Raises:
         InputError: a switch that is none.
     """
-    # The same ingredients in another order are the same row.
+    # The same ingredients in another order make the same row.
     rows = {frozenset[str](): Row(())}
     for name in chain.from_iterable(name.split(",") for name in names):
         off = tuple(dict.fromkeys(name.split("+"))) if name != FULL else ()

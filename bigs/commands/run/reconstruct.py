@@ -50,8 +50,8 @@ class Outcome:
     run: Path
     table: list[tuple[str, ...]]  # the first scores; the first row is the heading
     report: FitReport
-    seconds: float  # the sum of the report's, those of interrupted runs that this one continues included
-    meanings: tuple[str, ...] = ()  # what the scores of the table mean
+    seconds: float  # sum of the report's times, interrupted runs included
+    meanings: tuple[str, ...] = ()  # explanations of the scores in the table
 
 
 def reconstruct(
@@ -104,7 +104,7 @@ def reconstruct(
     out.mkdir(parents=True, exist_ok=True)
     with only_writer(out):
         remove_parts(out)
-        # A checkpoint of another configuration is refused; before there is one, the options count.
+        # A checkpoint of another configuration is refused; without one, compare the options.
         if not begun:
             save_config(out / CONFIG, config, origin)
         with RunLog(out / LOG, resume) as log:

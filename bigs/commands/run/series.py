@@ -16,10 +16,10 @@ from bigs.train.loop.profile import profiled
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import load_config
 
-# Written last: a folder that has it holds a finished run of a series.
+# Written last, so a folder that has it holds a finished run of a series.
 TIMES = "times.json"
 
-# Hears what is being done, in a few words.
+# Receives a short text on what is being done.
 Listener = Callable[[str], None]
 
 
@@ -42,7 +42,7 @@ class FinishedRun:
     times: dict[str, Any] = field(default_factory=dict)  # seconds; see `run_or_reuse`
     skipped: list[str] = field(default_factory=list)
     failure: str = ""  # why there is no result
-    reused: bool = False  # it was there already
+    reused: bool = False  # it was finished before
 
 
 def check_folders(runs: list[PlannedRun]) -> None:
@@ -81,7 +81,7 @@ def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> Finis
         scores = read_scores(run.folder)
         skipped = [row["text"] for row in read_log(run.folder / LOG) if row["event"] == "skipped"]
         return FinishedRun(scores, _read(run.folder / TIMES), skipped, reused=reused)
-    # Whatever stops one run is told in its row; the others are worth having.
+    # A failed run gets a row with the reason; the others go on.
     except Exception as error:
         return FinishedRun(failure=f"{type(error).__name__}: {error}")
 
