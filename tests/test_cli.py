@@ -78,11 +78,11 @@ def test_help(call: Callable[..., Answer], command: str) -> None:
         "prior train": "folder of meshes",
         "bench": "Measure speed",
         "ablate": "beside the paper's Table 3",
-        "bench adjustment": "consecutive frames a point is seen",
-        "bench engine": "runs of everything",
-        "bench motion": "from the poses that they come with",
+        "bench adjustment": "consecutive frames that see a point",
+        "bench engine": "rounds of everything",
+        "bench motion": "from their own poses",
         "bench preprocess": "simulated keypoints",
-        "bench reconstruct": "growth of the cost",
+        "bench reconstruct": "how the cost grows",
         "bench robustness": "worse masks, pictures, poses",
     }
     for word in [expected[command]] if command else [name for name in expected if " " not in name]:

@@ -1,4 +1,4 @@
-"""The command line: which commands there are, and how their failures are told. Only this package prints."""
+"""The command line: all commands, and how their failures are reported."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ IMPLIED = {"preprocess": "all"}
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; the exit code is 0 only on success.
 
-    With --debug, before or after the command, the traceback of whatever goes wrong is printed, too.
+    With --debug, before or after the command, the traceback of any error is printed too.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _told(error: Exception) -> tuple[str, int]:
-    """One sentence on what ended a command, and its exit code."""
+    """One sentence on the error that ended a command, and its exit code."""
     if isinstance(error, InputError):
         return str(error), 2
     if isinstance(error, FloatingPointError):
@@ -122,8 +122,7 @@ def _told(error: Exception) -> tuple[str, int]:
 
 
 def _in_full(arguments: list[str]) -> list[str]:
-    """The arguments with the command that a group stands for when none of its own follows its name, nor what
-    is nearly one."""
+    """Insert a group's default command, unless one of its commands or a near miss follows."""
     if len(arguments) < 2 or arguments[0] not in IMPLIED or arguments[1] in ("--help", "-h"):
         return arguments
     group, *others = arguments
@@ -134,7 +133,7 @@ def _in_full(arguments: list[str]) -> list[str]:
 
 
 def _parse(arguments: list[str]) -> Callable[[], None]:
-    """The command that the arguments ask for, ready to run; unknown options are refused in one line."""
+    """The command of the arguments, ready to run; unknown options are refused in one line."""
 
     said = io.StringIO()
     try:
@@ -157,7 +156,7 @@ def _parse(arguments: list[str]) -> Callable[[], None]:
 
 
 def _choice_of(commands: Commands) -> Any:
-    """The type from which the parser makes one of the commands, ready to run."""
+    """The type from which the parser builds one of the commands, ready to run."""
 
     def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
         @functools.wraps(command)

@@ -36,19 +36,19 @@ def batch(
     """Reconstruct many clips; finished ones are kept, and one that fails does not stop the others.
 
     Args:
-        manifest: clips and their options: .txt (a clip a line), .csv, .yaml or .json; see docs/batch.md.
+        manifest: clips and their options: .txt (one clip per line), .csv, .yaml or .json; see docs/batch.md.
         out: folder for one run folder per clip, summary.csv, summary.md and index.html.
         engine: processes on this machine, a Slurm cluster, or a Ray cluster.
-        workers: clips at a time; 0 takes as many as there are cores (processes) or all (slurm, ray).
-        threads: CPU threads for each clip; 0 shares this machine's out (processes) or is 2 (slurm, ray).
-        retries: further attempts at a clip that fails or whose worker dies, from its last checkpoint.
-        preset: for clips whose entry names neither a preset nor a config.
-        hand_model: for clips whose entry names none.
+        workers: clips at a time; 0 means one per core (processes) or all at once (slurm, ray).
+        threads: CPU threads per clip; 0 shares the cores out (processes) or means 2 (slurm, ray).
+        retries: further attempts at a failed clip, from its last checkpoint.
+        preset: preset of clips that set neither a preset nor a config.
+        hand_model: hand model of clips that set none.
         set: change one setting for all clips, as path=value; repeatable.
         without: leave out one ingredient for all clips; repeatable.
-        ray_address: of a running Ray cluster; without it (and RAY_ADDRESS) one is started on this machine.
-        slurm: an option of submitit, as name=value (slurm_partition=cpu, timeout_min=120); repeatable.
-        slurm_cluster: local runs submitit's jobs as processes of this machine, to try it out.
+        ray_address: a running Ray cluster; without it and RAY_ADDRESS a local one is started.
+        slurm: option of submitit as name=value (slurm_partition=cpu, timeout_min=120); repeatable.
+        slurm_cluster: local runs submitit's jobs as processes of this machine, for trials.
     """
     from bigs.commands.batch.manifest import read_manifest
     from bigs.commands.batch.run_batch import BatchPlan, plan_batch, run_batch, share_threads

@@ -32,13 +32,13 @@ def bench_engine(
         out: folder for engine.md, engine.json and engine.png.
         workloads: hand and object isotropic (A) and flat (B), dense scene (C), faint pile (D); taken from the
             folder that BIGS_BENCH names if it is set.
-        parts: what to measure beside plain times.
-        peers: other renderers to time in the same run, where they are installed.
+        parts: what to measure besides plain times.
+        peers: other renderers to time in the same run, if installed.
         threads: numbers of threads.
-        repeats: alternating runs of everything, of which the median counts.
-        budget: seconds after which one variant of a workload is not run again.
-        scale: of the number of Gaussians and of pixels; 0.01 takes seconds.
-        seed: of the workloads.
+        repeats: alternating rounds of everything; medians count.
+        budget: seconds after which a variant of a workload is not run again.
+        scale: factor on the number of Gaussians and of pixels; 0.01 takes seconds.
+        seed: random seed of the workloads.
     """
     from bigs.commands.bench.engine import bench_engine as run
 
@@ -73,17 +73,17 @@ def bench_reconstruct(
     """Time presets and switches over clips, with errors and where the time goes.
 
     Args:
-        clips: clips; one that has its gt.npz is scored.
+        clips: clips; those with gt.npz are scored.
         out: folder for the runs, reconstruct.md, .json and .png; finished runs are kept.
-        presets: what to run.
-        without: run the first preset without this, too (a name of reconstruct --without, or several joined
+        presets: presets to run.
+        without: also run the first preset without this (a name of reconstruct --without, or several joined
             by +); repeatable.
-        steps_limit: presets with more steps are cut to about so many, and say so; 0 runs all.
+        steps_limit: presets with more steps are cut to about this many, and say so; 0 runs all.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        frames: numbers of frames for which the growth of the cost is measured.
-        growth_steps: steps of each stage for that; 0 measures no growth.
+        frames: numbers of frames at which to measure how the cost grows.
+        growth_steps: steps of each stage for that; 0 skips it.
         picture: draw the picture, which needs matplotlib.
-        threads: CPU threads; 0 takes all.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.bench.run_tables import BRIEF
@@ -105,15 +105,15 @@ def bench_preprocess(
     seed: int = 0,
     threads: int = 0,
 ) -> None:
-    """Preprocess clips from their pictures, masks and simulated keypoints, as they are and made harder.
+    """Preprocess clips from pictures, masks and simulated keypoints, as they are and made harder.
 
     Args:
-        clips: clips with gt.npz, which scores the outcome and simulates the keypoints.
+        clips: clips with gt.npz, which scores the result and simulates the keypoints.
         out: folder for the clips made, preprocess.md and preprocess.json.
-        variants: which of the harder variants; all if not given.
+        variants: the harder variants to run; all by default.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        seed: of the noise.
-        threads: CPU threads; 0 takes all.
+        seed: random seed of the noise.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.bench.preprocess import PreprocessPlan
@@ -139,13 +139,13 @@ def bench_robustness(
     """Reconstruct clips as they are and with worse masks, pictures, poses and focal length.
 
     Args:
-        clips: clips with gt.npz; every run is scored on the clip as it is.
+        clips: clips with gt.npz; every run is scored against the clean clip.
         out: folder for damaged clips, runs, robustness.md and robustness.json; finished runs are kept.
-        damages: what to make worse; all, and all together, if not given.
-        preset: what to run.
+        damages: what to make worse; by default each, and all together.
+        preset: preset to run.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        seed: of what is drawn.
-        threads: CPU threads; 0 takes all.
+        seed: random seed.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.bench.clip_damage import DAMAGES
@@ -174,10 +174,10 @@ def bench_adjustment(
         out: folder for adjustment.md and adjustment.json.
         frames: numbers of frames.
         points: numbers of points.
-        seen: in how many consecutive frames a point is seen; 0 is all.
-        iterations: of each adjustment.
-        seed: of the objects.
-        threads: CPU threads; 0 takes all.
+        seen: number of consecutive frames that see a point; 0 is all.
+        iterations: iterations of each adjustment.
+        seed: random seed of the objects.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.bench.adjustment import AdjustmentPlan
@@ -197,16 +197,16 @@ def bench_motion(
     seed: int = 0,
     threads: int = 0,
 ) -> None:
-    """Track the object of clips from the poses that they come with, as they are and made worse.
+    """Track the object of clips from their own poses, as they are and made worse.
 
     Args:
-        clips: clips with gt.npz, which scores the outcome.
+        clips: clips with gt.npz, which scores the result.
         out: folder for motion.md and motion.json.
         variants: plain, poses (a tenth of them turned by 60 degrees), masks (3 pixels too wide or narrow),
-            both; all if not given.
+            both; all by default.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        seed: of what is drawn.
-        threads: CPU threads; 0 takes all.
+        seed: random seed.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.bench.motion import VARIANTS, MotionPlan

@@ -1,4 +1,4 @@
-"""Commands about clips before they are reconstructed: convert."""
+"""Commands on clips: convert."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def convert(
     Args:
         clip: the clip, see bigs info.
         out: folder to make.
-        view: full, or the paper's limited view: a quarter of the frames, which see the object from few sides.
-        every: keep every so many-th frame.
-        width: of the images; 0 keeps theirs.
-        masks: folder of label masks (0, 50 object, 150 right, 250 left) named as the images; the clip's own
-            if not given.
-        from_truth: start from a data set's ground truth. No fair start: for studies of what follows it.
+        view: full, or the paper's limited view: a quarter of the frames that shows the object from few sides.
+        every: keep every Nth frame.
+        width: width of the images; 0 keeps theirs.
+        masks: folder of label masks (0, 50 object, 150 right, 250 left) named like the images; the clip's own
+            by default.
+        from_truth: start from a data set's ground truth, to study what follows it; not a fair start.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
     """
     from bigs.commands.clips.convert import ConvertPlan

@@ -1,4 +1,4 @@
-"""Commands that make a clip from a video or from pictures: preprocess, whole and step by step."""
+"""Commands that make a clip from a video or from pictures: preprocess and its steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class FrameOptions:
-    """Which pictures become frames, and the camera that took them."""
+    """Which pictures become frames, and their camera."""
 
     K: tuple[float, float, float, float] | None = None
     """fx fy cx cy of the camera in pixels of the source; pixel centres at +0.5."""
@@ -78,7 +78,7 @@ class ObjectOptions:
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
-    """Everything that preprocessing needs beside the pictures."""
+    """Everything that preprocessing needs besides the pictures."""
 
     frames: Annotated[FrameOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FrameOptions)
     masks: Annotated[MaskOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=MaskOptions)
@@ -88,7 +88,7 @@ class VideoOptions:
     )
 
     def given(self) -> list[str]:
-        """The options that the user set, as they are written."""
+        """The options that the user set, as written on the command line."""
         return [
             f"--{option.name.replace('_', '-')}"
             for group in (self.frames, self.masks, self.hands, self.object)
@@ -115,10 +115,10 @@ def preprocess(
     Args:
         source: a video file or a folder of images.
         out: the clip folder to make; steps whose artefacts below it are up to date are skipped.
-        options: what the steps need.
+        options: options of the steps.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        redo: make every artefact anew, also those that another tool supplied.
-        threads: CPU threads; 0 takes all.
+        redo: make every artefact again, also those that another tool supplied.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     _run(_request(out, source, options, hand_model, redo), None)
@@ -133,7 +133,7 @@ def frames(
         source: a video file or a folder of images.
         out: the clip folder.
         options: which pictures, and the camera.
-        redo: make it anew though it is up to date.
+        redo: make it again even if it is up to date.
     """
     _run(_request(out, source, VideoOptions(frames=options), None, redo), ("frames",))
 
@@ -150,9 +150,9 @@ def masks(
     Args:
         clip: the clip folder.
         options: where the masks come from.
-        keypoints: JSON file of the hands' keypoints, which stand in for clicks on the hands with --sam2.
-        redo: make it anew though it is up to date.
-        threads: CPU threads; 0 takes all.
+        keypoints: JSON file of the hands' keypoints, used instead of clicks on the hands with --sam2.
+        redo: make it again even if it is up to date.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     if keypoints is not None and options.sam2 is None:
@@ -172,8 +172,8 @@ def object_motion(
     Args:
         clip: the clip folder.
         options: features and pairs.
-        redo: make it anew though it is up to date.
-        threads: CPU threads; 0 takes all.
+        redo: make it again even if it is up to date.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     _run(_request(clip, None, VideoOptions(object=options), None, redo), ("object",))
@@ -186,14 +186,14 @@ def hands(
     redo: bool = False,
     threads: int = 0,
 ) -> None:
-    """Step 4: pose, shape and place of the hands.
+    """Step 4: pose, shape and position of the hands.
 
     Args:
         clip: the clip folder.
         options: where the hands come from.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        redo: make it anew though it is up to date.
-        threads: CPU threads; 0 takes all.
+        redo: make it again even if it is up to date.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     _run(_request(clip, None, VideoOptions(hands=options), hand_model, redo), ("hands",))
@@ -205,8 +205,8 @@ def align(clip: Clip, hand_model: Path | None = None, redo: bool = False, thread
     Args:
         clip: the clip folder.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        redo: make it anew though it is up to date.
-        threads: CPU threads; 0 takes all.
+        redo: make it again even if it is up to date.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     _run(_request(clip, None, VideoOptions(), hand_model, redo), ("align",))
@@ -218,13 +218,13 @@ def build(clip: Clip, hand_model: Path | None = None, redo: bool = False) -> Non
     Args:
         clip: the clip folder.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        redo: make it anew though it is up to date.
+        redo: make it again even if it is up to date.
     """
     _run(_request(clip, None, VideoOptions(), hand_model, redo), ("build",))
 
 
 def clip_of(clip: Path, out: Path, options: VideoOptions, hand_model: Path | None) -> Path:
-    """The clip that `bigs reconstruct` was given, or what it makes of a video in `out/clip` first."""
+    """The clip given to `bigs reconstruct`, or the one made from a video in `out/clip`."""
     from bigs.preprocess.frames.source import is_source
 
     if not is_source(clip):
@@ -264,7 +264,7 @@ def _request(
 
 
 def _labels(words: tuple[str, ...]) -> dict[Entity, int]:
-    """right=1 left=2 object=3 as a dictionary."""
+    """Parse right=1 left=2 object=3 into a dictionary."""
     from bigs.types import ENTITIES
 
     found: dict[Entity, int] = {}

@@ -37,22 +37,22 @@ def prior_fit(
 
     Args:
         clip: a clip with object masks, in any layout that bigs info reads.
-        object: what it is, in a word or two, as in "mustard bottle".
+        object: name of the object in a word or two, such as "mustard bottle".
         model: a Stable Diffusion 1.5 or 2.1 folder as diffusers saves it, or its hub name.
-        out: the .safetensors file to write; any program that reads textual inversions takes it.
+        out: the .safetensors file to write, in the usual format of textual inversions.
         controlnet: a soft-edge ControlNet for that model, a folder or a hub name.
         edge_weights: PiDiNet (table5_pidinet.pth) for the ControlNet's edges; a built-in filter without it.
         token: the new word.
-        steps: how long to learn.
-        batch: pictures in a step; memory grows with it.
+        steps: training steps.
+        batch: pictures per step; memory grows with it.
         lr: learning rate.
         conditioning_scale: weight of the ControlNet.
-        seed: of all that is drawn.
+        seed: random seed.
         device: auto takes a GPU if there is one.
         precision: auto is float16 on a GPU and float32 on a CPU.
         attention_slicing: less memory, more time.
-        resume: go on from where an interrupted call was.
-        threads: CPU threads; 0 takes all.
+        resume: continue an interrupted call.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.prior.fit import InversionConfig, fit_token
@@ -97,16 +97,16 @@ def prior_train(
     Args:
         meshes: folder of .ply, .obj, .glb, .stl or .off files, of any size.
         out: the .safetensors file to write, 10 MB.
-        steps: how long to learn.
-        batch: pictures in a step.
+        steps: training steps.
+        batch: pictures per step.
         lr: learning rate.
-        views: pictures of each mesh.
+        views: pictures per mesh.
         width: channels of the network; 96 makes 2.6 million parameters.
         up: the meshes' axis that points up.
-        seed: of all that is drawn.
+        seed: random seed.
         device: auto takes a GPU if there is one.
-        resume: go on from where an interrupted call was.
-        threads: CPU threads; 0 takes all.
+        resume: continue an interrupted call.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.prior.train import PixelConfig, PixelTrainingConfig, train_prior

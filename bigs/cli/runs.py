@@ -57,7 +57,7 @@ DepthFormat = Literal["png", "npy"]
 
 
 def doctor() -> None:
-    """Say what is installed here, what is missing, and what that would enable."""
+    """List what is installed, what is missing, and what that would enable."""
     from bigs.commands.doctor import examine
 
     for heading, findings in examine():
@@ -67,13 +67,13 @@ def doctor() -> None:
 
 
 def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0, seed: int = 0) -> None:
-    """Make a little clip of two hands and a bottle, reconstruct it, and show how much better it became.
+    """Make a little clip of two hands and a bottle, reconstruct it, and print scores before and after.
 
     Args:
-        out: the run folder to make, with the clip in its folder clip; must be new or empty.
-        preset: how much work to put in.
-        threads: CPU threads; 0 takes all.
-        seed: of the clip and of the reconstruction.
+        out: the run folder to make, with the clip in out/clip; must be new or empty.
+        preset: how much work to do.
+        threads: CPU threads; 0 uses all cores.
+        seed: random seed of the clip and of the reconstruction.
     """
     use_threads(threads)
     from bigs.commands.progress import progress_listener
@@ -86,7 +86,7 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
 
 
 def info(clip: ClipPath, hand_model: Path | None = None) -> None:
-    """Check a clip and say what it holds.
+    """Check a clip and describe it.
 
     Args:
         clip: a clip of any layout: a HOLD / HANDS-challenge build folder, a sequence of ARCTIC's raw release
@@ -124,9 +124,9 @@ def reconstruct(
 
     Args:
         clip: a HOLD / HANDS-challenge build folder, or the folder that holds it; or a video or a folder of
-            images, which preprocessing makes a clip of first, in RUN/clip.
+            images, from which RUN/clip is made first.
         out: the run folder to make.
-        preset: smoke (seconds), demo, fast (minutes), full (if neither this nor a config is given), or paper
+        preset: smoke (seconds), demo, fast (minutes), full (the default), or paper
             (the paper's equations and weights).
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
         gt: ground truth to score against, which the reconstruction never sees: gt.npz, an ARCTIC raw sequence
@@ -137,16 +137,16 @@ def reconstruct(
         without: leave out one ingredient (share, smooth, contact, lighting, ...) or loss term; repeatable.
         perceptual_weights: VGG-16 as torchvision publishes it (.pth or .safetensors), for the term
             "perceptual" of the preset paper; with a second file of LPIPS's channel weights the term is LPIPS.
-        prior: what completes the object where no frame shows it: off, symmetry (if there is strong evidence
-            for one), trained or sd (symmetry, and where there is none a diffusion model), or auto: what the
-            weights are for; without any, what the preset says (off in smoke and paper, symmetry elsewhere).
+        prior: how to complete the object where no frame shows it: off, symmetry (if the evidence is strong),
+            trained or sd (symmetry, or else a diffusion model), or auto: what the weights are for; without
+            weights, what the preset says (off in smoke and paper, symmetry elsewhere).
         prior_weights: a file of bigs prior train, or Stable Diffusion 1.5 or 2.1: a folder or its hub name.
-        prior_object: what the object is, for Stable Diffusion, as in "mustard bottle".
+        prior_object: name of the object for Stable Diffusion, such as "mustard bottle".
         prior_controlnet: a soft-edge ControlNet for it, a folder or a hub name.
         prior_token: the object's learned word, a file of bigs prior fit.
         prior_edge_weights: PiDiNet (table5_pidinet.pth) for the ControlNet; a built-in filter without it.
-        threads: CPU threads; 0 takes all.
-        video: what preprocessing needs, when the clip is a video or a folder of images.
+        threads: CPU threads; 0 uses all cores.
+        video: options of preprocessing, if the clip is a video or a folder of images.
     """
     use_threads(threads)
     from bigs.commands.prior.weights import with_prior
@@ -192,29 +192,29 @@ def render(
     background: str = "transparent",
     threads: int = 0,
 ) -> None:
-    """Render a finished run from a file's cameras, in a turn, or as its clip was filmed; pictures or video.
+    """Render a finished run as pictures or video: an orbit, the clip's own camera, or the cameras of a file.
 
     Args:
         run: the run folder.
         cameras: a transforms.json of instant-ngp, nerfstudio or Blender, or a camera path that nerfstudio's
-            viewer saved (OpenGL camera-to-world). A frame_index in it says which time a camera shows; without
-            one --frame or --play does.
-        out: folder for 0000.png, 0001.png, ...: RGBA with straight colour, or RGB before a background.
-        orbit: a turn around the image's vertical, at one time or while the clip plays.
-        from_input: the clip's own camera, every frame or the one that --frame names.
-        frame: the time to show; an orbit without it shows the clip's middle.
-        play: show the next frame of the clip in each picture, and the first again after the last.
-        about: what the orbit turns about; the object if there is one.
-        pictures: of the orbit; 120, or with --play the clip's number of frames.
-        size: width and height, where the cameras have none of their own; the clip's if not given. An orbit
-            and the clip's own camera keep their vertical angle.
-        world: what the cameras of a file are placed in: the clip's camera frame (x right, y down, z forward;
-            metres), which is the default, or the object's own frame, which stands still as the object moves.
-        video: an .mp4 file of the pictures, 30 a second or as many as a camera path says; needs the extra
+            viewer saved (OpenGL camera-to-world). A frame_index in it sets the frame that a camera shows;
+            otherwise --frame or --play does.
+        out: folder for 0000.png, 0001.png, ...: RGBA with straight colour, or RGB over a background.
+        orbit: a turn around the image's vertical, at one frame or while the clip plays.
+        from_input: the clip's own camera, in every frame or in --frame.
+        frame: the frame to show; an orbit without it shows the clip's middle frame.
+        play: show the next frame of the clip in each picture, in a loop.
+        about: centre of the orbit; the object if there is one.
+        pictures: number of pictures of the orbit; 120, or with --play the clip's number of frames.
+        size: width and height for cameras without a size; the clip's by default. An orbit and the clip's
+            own camera keep their vertical angle.
+        world: frame of a file's cameras: the clip's camera frame (x right, y down, z forward; metres; the
+            default), or the object's own frame, which moves with the object.
+        video: an .mp4 file of the pictures, at 30 frames a second or a camera path's rate; needs the extra
             video.
         depth: also write OUT/depth/0000.png in 16-bit millimetres, or 0000.npy in metres; 0 where nothing is.
         background: white, black, R,G,B (each 0 to 255) or transparent, which is black in a video.
-        threads: CPU threads; 0 takes all.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.render.views import Shot, Wanted, background_of, render_run
@@ -244,15 +244,15 @@ def export(
 
     Args:
         run: the run folder.
-        format: repeat it for several. Gaussians: ply (each subject unposed, or posed at chosen frames), spz,
+        format: repeatable. Gaussians: ply (each subject unposed, or posed at chosen frames), spz,
             splat-glb (glTF with KHR_gaussian_splatting). Meshes: glb (animated: hands with skeletons,
             object), obj (all subjects at chosen frames, coloured), mesh (object), hand-meshes. Poses: poses
             (npz), mano, arctic, challenge (.pt). All together over time: rerun.
         out: where to write; the run folder if not given.
-        frames: times to write, for ply, spz, splat-glb, obj and hand-meshes. If not given, ply is unposed,
-            hand-meshes has every frame, and the others the clip's middle one.
-        all_frames: write every time, for the same formats.
-        clip: the clip with the input images, for rerun, if it is not where the run found it.
+        frames: frames to write, for ply, spz, splat-glb, obj and hand-meshes. By default ply is unposed,
+            hand-meshes has every frame, and the others have the clip's middle one.
+        all_frames: write every frame, for the same formats.
+        clip: the clip with the input images, for rerun, if it has moved.
     """
     from bigs.checks import InputError
     from bigs.commands.export.formats import Choice, check_format, write_format
@@ -293,8 +293,8 @@ def view(
     Args:
         run: the run folder.
         host: address to listen at; the default can be reached from this machine only.
-        port: where to listen; the next free port is taken if it is in use.
-        clip: the clip with the input images, if it is not where the run found it.
+        port: port to listen at; the next free one if it is taken.
+        clip: the clip with the input images, if it has moved.
         gt: ground truth to show beside the result, as for bigs eval.
     """
     from bigs.commands.render.live import view as serve
@@ -321,15 +321,15 @@ def ablate(
 
     Args:
         clip: a HOLD / HANDS-challenge build folder, or the folder that holds it.
-        out: folder for one run per row, ablation.md and ablation.json; rows that it holds are not run again.
-        preset: the full method; fast if neither this nor a config is given.
-        rows: what to leave out, each a name of reconstruct --without or several joined by +; the paper's if
-            not given.
+        out: folder for one run per row, ablation.md and ablation.json; finished rows are kept.
+        preset: the full method; fast by default.
+        rows: what to leave out, each a name of reconstruct --without or several joined by +; the paper's by
+            default.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
-        gt: ground truth (gt.npz) to score against; the clip's own if not given.
+        gt: ground truth (gt.npz) to score against; the clip's own by default.
         config: a config.yaml of an earlier run, instead of a preset.
         set: change one setting, as path=value; repeatable.
-        threads: CPU threads; 0 takes all.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.run.ablate import ablate as run

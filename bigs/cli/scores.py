@@ -1,4 +1,4 @@
-"""Commands about how good runs are: eval, and submission for others to judge them."""
+"""Commands that score runs: eval and submission."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ def evaluate(
     all: bool = False,
     threads: int = 0,
 ) -> None:
-    """Score finished runs with the field's own definitions; several stand beside the paper's tables.
+    """Score finished runs as the field's evaluators do; several make a table beside the paper's.
 
     Each run gets its scores in metrics.json, scores.csv and report.html, and a row per frame in frames.csv.
 
     Args:
         runs: run folders.
         gt: ground truth of one run: gt.npz or the folder that holds it, a sequence of ARCTIC's raw release
-            (ROOT/s05/box_grab_01/1), or a clip of HO-3D; the run's own clip's gt.npz if not given.
-        clip: images and masks of one run; the run's own clip if not given.
-        novel: held-back views of one run (image/, mask/, cameras.npz); its clip's folder novel if not given.
-        hand_model: MANO-format files for a data set's poses; those of the run if not given.
+            (ROOT/s05/box_grab_01/1), or a clip of HO-3D; the gt.npz of the run's own clip by default.
+        clip: images and masks of one run; the run's own clip by default.
+        novel: held-out views of one run (image/, mask/, cameras.npz); its clip's folder novel by default.
+        hand_model: MANO-format files for a data set's poses; the run's own by default.
         perceptual_weights: VGG-16 as torchvision publishes it, and LPIPS's channel weights, for LPIPS.
-        out: folder for comparison.md and comparison.csv, with the paper's Tables 1, 2 and 4 beside.
-        all: show every score of a run, not only the first five; scores.csv in its folder has them, too.
-        threads: CPU threads; 0 takes all.
+        out: folder for comparison.md and comparison.csv, beside the paper's Tables 1, 2 and 4.
+        all: show every score of a run, not only the first five; scores.csv has them too.
+        threads: CPU threads; 0 uses all cores.
     """
     use_threads(threads)
     from bigs.commands.evaluate.paper_tables import beside_paper
@@ -81,14 +81,14 @@ def submission(
 ) -> None:
     """Pack finished runs into the ARCTIC challenge's arctic_preds.zip, or check such a zip.
 
-    Every file name, key, shape and type that the server reads is checked; it names no mistake itself.
+    Every file name, key, shape and type that the server reads is checked, since it reports no mistake.
 
     Args:
-        archive: the zip; written if runs are given, else checked.
+        archive: the zip to write, or to check if no runs are given.
         runs: run folders, one for each sequence.
-        sequences: what the server wants; the nine clips of subject 3 and camera 1 if not given.
+        sequences: expected sequences; the nine clips of subject 3 and camera 1 by default.
         hold_class: write dictionaries of HOLD's class common.xdict.xdict, for an evaluator that calls its
-            methods; plain Python then cannot open them without that class.
+            methods; opening them then needs that class.
     """
     from bigs.commands.export.submission import submit
 

@@ -1,4 +1,4 @@
-"""What the commands share: how they speak, which settings they make of their options, threads."""
+"""What the commands share: output, settings from options, threads."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MOST_THREADS = 4096
 
 
 class _Output(Console):
-    """A console whose reader may leave: what comes then is nobody's, and the command goes on to its end."""
+    """A console whose reader may leave: further output is dropped and the command continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -47,10 +47,10 @@ class _Output(Console):
 
 
 def _open_streams() -> None:
-    """Give a process that was started with closed streams (`>&-`) some that lead nowhere.
+    """Open null streams for a process that was started with closed ones (`>&-`).
 
-    Else the next file that is opened would take their place, and get what is meant for them. And a name from
-    a file system that is no text shall be shown somehow, on standard output as on standard error.
+    Otherwise the next opened file would take their numbers and receive their output. File names that are
+    no valid text are shown escaped on both streams.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
@@ -68,21 +68,21 @@ stderr = _Output(stderr=True)
 
 
 def say(text: str) -> None:
-    """A line on standard output, as it is: nothing coloured, nothing wrapped."""
+    """Print a line on standard output without colours or wrapping."""
     stdout.print(plain(text), markup=False, highlight=False, emoji=False, soft_wrap=True)
 
 
 def plain(text: str) -> str:
-    """Text without anything that would steer a terminal, as names from a file may have it.
+    """Text without control sequences, which names from a file may contain.
 
-    What does not print, but for the ends of lines, is shown as Python writes it.
+    Unprintable characters, except line ends, are shown as Python escapes.
     """
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager
 def until_nobody_reads() -> Iterator[None]:
-    """End the command, well, when the reader of a help text, which others print, has left."""
+    """Exit with success if the reader of a help text has left."""
     try:
         yield
     except BrokenPipeError:
@@ -92,7 +92,7 @@ def until_nobody_reads() -> Iterator[None]:
 
 @contextmanager
 def telling() -> Iterator[Callable[[str], None]]:
-    """Shows what is being done, as the block tells it; in lines where there is no terminal."""
+    """Show the block's progress; as lines without a terminal."""
     if stderr.is_terminal:
         with stderr.status("starting") as status:
             yield status.update
@@ -102,7 +102,7 @@ def telling() -> Iterator[Callable[[str], None]]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """End with one line on standard error, whatever a file has put into the message."""
+    """Exit with one line on standard error, whatever the message contains."""
     line = plain(message.replace("\n", "\\n"))
     if len(line) > _LONGEST_LINE:
         line = f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 2 :]}"
@@ -124,10 +124,10 @@ def use_threads(threads: int) -> None:
 def settings_of(
     preset: Preset | None, file: Path | None, changes: tuple[str, ...], default: Preset = "full"
 ) -> RunConfig:
-    """The settings of a preset or of a file, with changes; `default` names the preset where neither is given.
+    """The settings of a preset or of a file, with changes; `default` is the preset if neither is given.
 
     Raises:
-        InputError: both are given, or one is not as it should be.
+        InputError: both are given, or one is invalid.
     """
     if preset is not None and file is not None:
         raise InputError(
@@ -148,7 +148,7 @@ def print_tables(tables: list[Table], out: Path) -> None:
 
 
 def fail_for(runs: list[str]) -> None:
-    """The exit of a series of which some runs came to nothing."""
+    """Exit of a series in which some runs failed."""
     if runs:
         fail(f"{len(runs)} failed ({', '.join(runs)}); the others are kept, and a rerun tries these again", 5)
 

@@ -1,6 +1,6 @@
-"""What was probably meant: commands, options and choices are looked at before the parser sees them.
+"""Suggestions for typing errors in commands, options and choices, before the parser sees them.
 
-The parser knows all of this, too, but tells it in boxes of many lines, for every command at once.
+The parser would report them in boxes of many lines, for every command at once.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OPTION = re.compile(r"--\w|-[A-Za-z]$")
 
 
 class Word(typing.NamedTuple):
-    """What a command takes: an option, or a word in its place."""
+    """What a command takes: an option or a positional word."""
 
     name: str  # with its dashes, or as shown in the help
     kind: Any  # its type without the parser's annotations
@@ -33,15 +33,15 @@ class Word(typing.NamedTuple):
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """What it accepts where that can be listed."""
+        """The accepted words, if they can be listed."""
         return _choices(self.kind)
 
 
 def check_words(commands: Mapping[str, Any], arguments: Sequence[str]) -> None:
-    """Refuse a command, an option or a choice that there is not, and name the nearest that there is.
+    """Refuse an unknown command, option or choice and suggest the nearest one.
 
     Args:
-        commands: name -> function, or the same of a group.
+        commands: name -> function, or a group's dictionary of these.
         arguments: all words after the program's name.
 
     Raises:
@@ -63,8 +63,7 @@ def check_words(commands: Mapping[str, Any], arguments: Sequence[str]) -> None:
 
 
 def words_of(command: Callable[..., Any]) -> tuple[list[Word], list[Word]]:
-    """The options of a command as its signature has them, flags with their opposite, and the words that
-    have a place."""
+    """The options of a command from its signature, flags with their opposite, and its positional words."""
     options: list[Word] = []
     places: list[Word] = []
     hints = typing.get_type_hints(command, include_extras=True)
@@ -86,7 +85,7 @@ def words_of(command: Callable[..., Any]) -> tuple[list[Word], list[Word]]:
 
 
 def _plain(kind: Any) -> tuple[list[Any], Any]:
-    """What is said to the parser of a type, and the type itself."""
+    """The parser's annotations of a type, and the type itself."""
     said: list[Any] = []
     while typing.get_origin(kind) is typing.Annotated:
         kind, *more = typing.get_args(kind)
@@ -95,14 +94,14 @@ def _plain(kind: Any) -> tuple[list[Any], Any]:
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:
-    """What a type may be, None aside."""
+    """The alternatives of a type, except None."""
     if typing.get_origin(kind) not in (typing.Union, types.UnionType):
         return (kind,)
     return tuple(part for part in typing.get_args(kind) if part is not type(None))
 
 
 def _most(kind: Any) -> float:
-    """How many words a value of a type takes."""
+    """Number of words that a value of a type takes."""
     (kind, *_) = _alternatives(kind)
     if kind is bool:
         return 0
@@ -158,7 +157,7 @@ def _check_options(path: str, options: Sequence[Word], places: Sequence[Word], w
 
 
 def _check_none_lacks(option: Word | None, left: float) -> None:
-    """Refuse an option that still waits for all of its words but one that takes any number."""
+    """Refuse an option without its words, unless it takes any number."""
     if option is not None and left == option.most and 0 < left < math.inf:
         raise InputError(f"{option.name}: expected a value, found none")
 

@@ -46,7 +46,7 @@ def load_novel_views(folder: str | Path, frame_count: int) -> list[NovelView]:
     """
     folder = Path(folder)
     file = folder / CAMERAS
-    arrays = read_npz(file, "the cameras of held-back views")
+    arrays = read_npz(file, "the cameras of held-out views")
     image_paths = list_frames(folder / "image", IMAGE_SUFFIXES)
     mask_paths = list_frames(folder / "mask", MASK_SUFFIXES)
     check_pairs(image_paths, mask_paths)

@@ -28,7 +28,7 @@ def frame_scores(clip: Clip, playback: Playback, distance: Distance | None = Non
 def novel_scores(
     playback: Playback, folder: Path, distance: Distance | None = None, scale: float | None = None
 ) -> dict[str, float]:
-    """Mean image scores of held-back views, under the keys of novel views.
+    """Mean image scores of held-out views, under the keys of novel views.
 
     Args:
         playback: the reconstruction.

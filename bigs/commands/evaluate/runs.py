@@ -142,7 +142,7 @@ def evaluate_run(
         told |= partly(pictures)
     novel = plan.novel or _own_novel(clip_path)
     if novel is not None:
-        listen(f"{run.name}: held-back views")
+        listen(f"{run.name}: held-out views")
         result |= novel_scores(playback, novel, distance, result.get("clip_scale"))
     if distance is None:
         remarks.append("LPIPS is not scored: no weights (--perceptual-weights)")

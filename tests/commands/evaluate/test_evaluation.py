@@ -1,4 +1,4 @@
-"""Scores of a finished run: from every source of truth, per frame, of held-back views, beside the paper."""
+"""Scores of a finished run: from every source of truth, per frame, of held-out views, beside the paper."""
 
 from __future__ import annotations
 
