@@ -10,6 +10,7 @@ from bigs.commands.folder.contents import CHECKPOINTS, CONFIG, LOG, METRICS, wri
 from bigs.commands.run.reconstruct import run_origin
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import save_config
+from bigs.train.resolve import resolve
 from bigs.train.switches import SWITCHES, without
 
 SCORES = {
@@ -51,7 +52,7 @@ class FakeRuns:
         assert resume == (out / CONFIG).exists()
         self.made.append(out.name)
         out.mkdir(exist_ok=True)
-        save_config(out / CONFIG, config, run_origin(clip, hand_model))
+        save_config(out / CONFIG, resolve(config).config, run_origin(clip, hand_model))
         listen({"event": "stage", "stage": "joint", "index": 0, "stages": 1})
         listen({"event": "step", "stage": "joint", "step": 1, "steps": 2, "seconds": 0.5})
         if out.name == self.fail:

@@ -25,6 +25,7 @@ from bigs.commands.folder.options import check_same_options
 from bigs.commands.run.reconstruct import reconstruct, run_origin
 from bigs.train.plan.config_file import save_config
 from bigs.train.plan.presets import PRESETS
+from bigs.train.resolve import resolve
 
 pytestmark = pytest.mark.slow
 
@@ -124,14 +125,15 @@ def test_another_option_is_named_with_both_values(
 
 def test_another_preset_is_named(tmp_path: Path) -> None:
     origin = run_origin(tmp_path, None)
-    save_config(tmp_path / "config.yaml", PRESETS["smoke"], origin)
-    check_same_options(tmp_path, PRESETS["smoke"], origin)
+    smoke, fast = (resolve(PRESETS[name]).config for name in ("smoke", "fast"))
+    save_config(tmp_path / "config.yaml", smoke, origin)
+    check_same_options(tmp_path, smoke, origin)
     with pytest.raises(InputError, match="--preset: expected smoke, as the run has it, found fast"):
-        check_same_options(tmp_path, PRESETS["fast"], origin)
+        check_same_options(tmp_path, fast, origin)
     with pytest.raises(InputError, match=r"--hand-model: expected the built-in hand, .* found .*mano"):
-        check_same_options(tmp_path, PRESETS["smoke"], run_origin(tmp_path, tmp_path / "mano"))
+        check_same_options(tmp_path, smoke, run_origin(tmp_path, tmp_path / "mano"))
     with pytest.raises(InputError, match=r"expected a run of bigs 99, found one of "):
-        check_same_options(tmp_path, PRESETS["smoke"], {**origin, "bigs": "99"})
+        check_same_options(tmp_path, smoke, {**origin, "bigs": "99"})
 
 
 def test_files_that_have_moved_are_no_other_options(tmp_path: Path) -> None:

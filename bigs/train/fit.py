@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 import bigs
+from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
@@ -40,8 +41,7 @@ from bigs.train.plan.config import (
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
 from bigs.train.start.object_motion import find_object_motion, in_words
-from bigs.train.switches import without
-from bigs.train.unseen.stages import run_completion, run_guidance, without_missing_prior
+from bigs.train.unseen.stages import run_completion, run_guidance
 from bigs.types import Side
 
 
@@ -53,6 +53,7 @@ class FitReport:
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
     facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
+    completed: bool = False  # whether symmetry has completed the object
     # Seconds of the interrupted runs that this one continues; they count in `seconds`, too.
     before: float = 0.0
 
@@ -78,21 +79,21 @@ def fit(
     Args:
         clip: the loaded clip.
         hand_models: both sides' models.
-        config: what to do.
-        perceptual: the network for the term of that name; without it the term is off.
-        denoiser: the diffusion prior of the plan's `GuidanceStage`; without it there is no such stage.
+        config: what to do; `resolve` leaves out what it has no network for.
+        perceptual: the network for the term of that name.
+        denoiser: the diffusion prior of the plan's `GuidanceStage`.
         checkpoints: folder for checkpoints; None keeps none.
         resume: continue from the checkpoint there, if there is one.
         listen: told of stages, steps and notes as they happen.
         watch: goes on through the stages; a new one if not given.
 
     Raises:
-        InputError: the configuration names unknown groups or terms, or the checkpoint is of another run.
+        InputError: the configuration names unknown groups or terms or needs a network that is not given, or
+            the checkpoint is of another run.
         FloatingPointError: a loss became infinite or not a number.
     """
     report = FitReport()
-    config, network_note = _without_missing_network(config, perceptual)
-    config, prior_note = without_missing_prior(config, clip, denoiser)
+    _check_networks(config, perceptual, denoiser)
     torch.manual_seed(config.seed)
     watch = watch or Stopwatch("start values")
     watch.begin("start values")
@@ -115,7 +116,7 @@ def fit(
     )
     scene = start.scene
     gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
-    report.skipped += [note for note in (network_note, prior_note) if note] + start.skipped
+    report.skipped += start.skipped
     report.seconds = watch.read()
     digest = run_digest(clip, scene, config, perceptual, denoiser)
     position = load_checkpoint(checkpoints, scene, digest) if checkpoints and resume else None
@@ -126,8 +127,6 @@ def fit(
         report = FitReport(**position.report)
         report.before = sum(report.seconds.values())
         watch.add(report.seconds)
-    elif network_note:
-        listen({"event": "note", "stage": "start values", "text": network_note})
     sources = EvidenceSource(clip, unknown, scene, config, perceptual)
 
     def keep(index: int, state: StageState | None) -> None:
@@ -139,9 +138,7 @@ def fit(
     for index, stage in enumerate(config.stages):
         if index < first or isinstance(stage, ObjectMotionStage):
             continue
-        why = _not_needed(stage, scene)
-        if isinstance(stage, GuidanceStage) and "object completed" in report.facts:
-            why = "symmetry has completed the object"
+        why = _not_needed(stage, scene, report)
         if why:
             report.skipped.append(f"{stage.name}: {why}")
             continue
@@ -165,6 +162,7 @@ def fit(
         elif isinstance(stage, CompletionStage | GuidanceStage):
             if isinstance(stage, CompletionStage):
                 done = run_completion(scene, stage, sources, config, start.symmetries)
+                report.completed = done.skipped is None
             else:
                 done = run_guidance(scene, stage, index, sources, config, denoiser, continues, keep, listen)
             if done.skipped:
@@ -182,7 +180,7 @@ def fit(
         keep(index + 1, None)
     report.seconds = watch.read()
     scene.requires_grad_(False)
-    if start.known and "object completed" not in report.facts:
+    if start.known and not report.completed:
         scene.replace_surface(start.known.of(scene.object_surface))
         report.facts["object mesh"] = (
             f"open: {start.known.left_out:.0%} of it would be further than "
@@ -258,31 +256,26 @@ def _optimise(
     )
 
 
-def _without_missing_network(config: RunConfig, network: VggWeights | None) -> tuple[RunConfig, str | None]:
-    """The configuration without the term that needs a network, if there is none; what to tell the user."""
-    asking = [
-        stage.name
-        for stage in config.stages
-        if isinstance(stage, OptimizeStage) and "perceptual" in stage.weights
-    ]
-    if network is not None:
-        unused = "a network was given, but no stage has the term (--set stages.NAME.weights.perceptual=1)"
-        return config, None if asking else f"perceptual: {unused}"
-    if not asking:
-        return config, None
-    return without(config, "perceptual"), (
-        f"perceptual: off in {', '.join(asking)}; --perceptual-weights FILE with VGG-16 turns it on"
-    )
+def _check_networks(config: RunConfig, perceptual: VggWeights | None, denoiser: Denoiser | None) -> None:
+    for stage in config.stages:
+        if isinstance(stage, OptimizeStage) and "perceptual" in stage.weights and perceptual is None:
+            raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
+        if isinstance(stage, GuidanceStage) and denoiser is None:
+            raise InputError(f"stage {stage.name}: expected a prior's model, found none")
 
 
-def _not_needed(stage: Stage, scene: Scene) -> str | None:
+def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
     if isinstance(stage, ScaleSearchStage | GraspStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
-    if isinstance(stage, CompletionStage | GuidanceStage):
-        return "the clip has no object" if scene.object_splats is None else None
+    if isinstance(stage, CompletionStage | GuidanceStage) and scene.object_splats is None:
+        return "the clip has no object"
+    if isinstance(stage, CompletionStage):
+        return None
+    if isinstance(stage, GuidanceStage):
+        return "symmetry has completed the object" if report.completed else None
     if isinstance(stage, SplitStage):
         return "the clip has no object" if scene.object_splats is None and not stage.hands else None
     if not stage.weights:

@@ -16,6 +16,7 @@ from bigs.train.fit import fit
 from bigs.train.loop.targets import crop_box
 from bigs.train.plan.config import OptimizeStage, RunConfig
 from bigs.train.plan.length import planned_steps
+from bigs.train.resolve import resolve
 from bigs.types import Side
 
 # Factors on the number of Gaussians: one subdivision of the hand's mesh multiplies them by four.
@@ -61,12 +62,13 @@ def measure(clip: Clip, hand_models: Mapping[Side, HandModel], probe: Probe, ste
         was: "frames", "gaussians" and "pixels" of the finest stage.
     """
     clip = excerpt(clip, to_and_fro(len(clip), probe.frames))
-    planned = planned_steps(probe.config)
+    config = resolve(probe.config).config
+    planned = planned_steps(config)
     short = replace(
-        probe.config,
+        config,
         stages=tuple(
             replace(stage, steps=min(stage.steps, steps)) if isinstance(stage, OptimizeStage) else stage
-            for stage in probe.config.stages
+            for stage in config.stages
         ),
     )
     seconds: dict[str, list[float]] = {}

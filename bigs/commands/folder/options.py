@@ -12,6 +12,7 @@ from bigs.commands.folder.contents import CONFIG
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import load_config, to_plain
 from bigs.train.plan.presets import PRESETS
+from bigs.train.resolve import resolve
 
 # Files may move between two parts of a run; what is in them is looked at when its checkpoint is read.
 _PLACES = ("perceptual_weights", "prior.weights", "prior.controlnet", "prior.token", "prior.edge_weights")
@@ -23,7 +24,7 @@ def check_same_options(run: Path, config: RunConfig, origin: Mapping[str, str | 
 
     Args:
         run: the run folder, which has a config.yaml.
-        config: what it is to be continued with.
+        config: what it is to be continued with, resolved.
         origin: `run_origin` of the clip and the hand model that it is to be continued with.
 
     Raises:
@@ -36,7 +37,8 @@ def check_same_options(run: Path, config: RunConfig, origin: Mapping[str, str | 
         for path, old, new in _differences(to_plain(stored), to_plain(config))
         if path not in _PLACES
     ]
-    names = [next((name for name, preset in PRESETS.items() if preset == c), None) for c in (stored, config)]
+    presets = {name: resolve(preset).config for name, preset in PRESETS.items()}
+    names = [next((name for name, preset in presets.items() if preset == c), None) for c in (stored, config)]
     if differing and None not in names:
         raise InputError(f"--preset: expected {names[0]}, as the run has it, found {names[1]}; {again}")
     if differing:

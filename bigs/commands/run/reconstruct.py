@@ -40,6 +40,7 @@ from bigs.train.loop.checkpoint import FILE_NAME
 from bigs.train.loop.stopwatch import Stopwatch
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import save_config
+from bigs.train.resolve import resolve
 from bigs.train.start.initial import initial_trajectory
 
 
@@ -72,7 +73,7 @@ def reconstruct(
     Args:
         clip_path: a clip with estimates, of any layout.
         out: the run folder; made if missing. One that holds a run is refused unless `resume` is set.
-        config: see `bigs.train.plan.presets`.
+        config: see `bigs.train.plan.presets`. The run folder's config.yaml is what `resolve` makes of it.
         hand_model: folder or file of MANO-format models; None takes the built-in hand.
         ground_truth: scores the result and the initial estimates (see `load_truth`); never seen by the
             optimisation.
@@ -88,6 +89,8 @@ def reconstruct(
     check_plan(config)
     hand_models = load_hand_models(hand_model)
     clip = open_estimates(clip_path, hand_models)
+    resolved = resolve(config, has_object=clip.object is not None)
+    config = resolved.config
     files = [Path(path) for path in config.perceptual_weights]
     network = load_perceptual_weights(files) if files else None
     denoiser = load_prior(config.prior)
@@ -116,6 +119,8 @@ def reconstruct(
 
             for note in clip.notes:
                 log_and_listen({"event": "note", "stage": "clip", "text": f"note: {note}"})
+            if resolved.perceptual and not begun:
+                log_and_listen({"event": "note", "stage": "start values", "text": resolved.perceptual})
             listen({"event": "note", "stage": "start values", "text": "finding start values"})
             scene, report = fit(
                 clip,
@@ -128,6 +133,7 @@ def reconstruct(
                 listen=log_and_listen,
                 watch=watch,
             )
+            report.skipped[:0] = resolved.notes
             watch.begin("results")
             if clip.notes:
                 report.facts["estimates"] = "; ".join(clip.notes)

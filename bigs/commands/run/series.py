@@ -15,6 +15,7 @@ from bigs.files import read_json, read_yaml
 from bigs.train.loop.profile import profiled
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import load_config
+from bigs.train.resolve import resolve
 
 # Written last, so a folder that has it holds a finished run of a series.
 TIMES = "times.json"
@@ -55,7 +56,7 @@ def check_folders(runs: list[PlannedRun]) -> None:
         path = run.folder / CONFIG
         if not path.exists():
             continue
-        if load_config(path) != run.config:
+        if load_config(path) != resolve(run.config).config:
             raise InputError(
                 f"{path}: expected the configuration of this run, found another (remove the folder)"
             )

@@ -1,12 +1,10 @@
-"""The stages that complete the object where no frame shows it, and what a run without a prior has."""
+"""The stages that complete the object where no frame shows it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
-from bigs.data.base import Clip
 from bigs.geometry.symmetry import Symmetry
 from bigs.guidance.denoiser import Denoiser
 from bigs.models.scene import Scene
@@ -62,24 +60,3 @@ def run_guidance(
 
     evidence = sources.evidence(_OBSERVED_AT)
     return guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, resume, after_step)
-
-
-def without_missing_prior(
-    config: RunConfig, clip: Clip, denoiser: Denoiser | None
-) -> tuple[RunConfig, str | None]:
-    """The configuration without the stages that the prior leaves nothing to do; what to tell the user."""
-    if config.prior.kind == "off":
-        config = _leave_out(config, CompletionStage)
-    if denoiser is not None:
-        asking = any(isinstance(stage, GuidanceStage) for stage in config.stages)
-        return config, None if asking else "prior: weights were given, but no stage of this plan uses them"
-    note = (
-        "prior: no diffusion; --prior-weights turns it on, with a FILE of bigs prior train "
-        "or a FOLDER of Stable Diffusion"
-    )
-    wanted = config.prior.kind != "off" and clip.object is not None
-    return _leave_out(config, GuidanceStage), note if wanted else None
-
-
-def _leave_out(config: RunConfig, kind: type) -> RunConfig:
-    return replace(config, stages=tuple(stage for stage in config.stages if not isinstance(stage, kind)))

@@ -22,6 +22,7 @@ from bigs.commands.run.reconstruct import run_origin
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import save_config
 from bigs.train.plan.presets import PRESETS
+from bigs.train.resolve import resolve
 
 
 class Clips:
@@ -35,7 +36,7 @@ class Clips:
         self, clip: Path, out: Path, config: RunConfig, *, hand_model: Path | None, resume: bool, **_: Any
     ) -> None:
         self.calls.append((out.name, resume))
-        save_config(out / CONFIG, config, run_origin(clip, hand_model))
+        save_config(out / CONFIG, resolve(config).config, run_origin(clip, hand_model))
         ends = self.ends.get(out.name, [None])
         end = ends.pop(0) if len(ends) > 1 else ends[0]
         if end is not None:
@@ -253,7 +254,9 @@ def test_another_run_in_the_folder_is_refused(
     from bigs.train.plan.config_file import save_config
 
     (tmp_path / "out" / "a").mkdir(parents=True)
-    save_config(tmp_path / "out" / "a" / CONFIG, PRESETS["fast"], run_origin(tmp_path / "a", None))
+    save_config(
+        tmp_path / "out" / "a" / CONFIG, resolve(PRESETS["fast"]).config, run_origin(tmp_path / "a", None)
+    )
     (tmp_path / "m.txt").write_text("b\na\n")
     answer = call("batch", tmp_path / "m.txt", "--out", tmp_path / "out", "--preset", "smoke")
     assert_refused(answer, "config.yaml", "expected the configuration of this run")

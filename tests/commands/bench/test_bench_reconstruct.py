@@ -23,6 +23,7 @@ from bigs.train.plan.config import OptimizeStage
 from bigs.train.plan.config_file import load_config
 from bigs.train.plan.length import planned_steps
 from bigs.train.plan.presets import PRESETS
+from bigs.train.resolve import resolve
 from bigs.types import Side
 
 SMOKE = PRESETS["smoke"]
@@ -101,7 +102,7 @@ def test_runs_and_probes_are_kept(
     found = bench_reconstruct(plan, out, picture=False)
     assert found.failed == ["clip: smoke without share", "other: smoke without share"]
     assert runs.made == ["smoke", "smoke-without-share"] * 2
-    assert load_config(out / "other" / "smoke" / CONFIG) == SMOKE
+    assert load_config(out / "other" / "smoke" / CONFIG) == resolve(SMOKE).config
     assert len(probed) == 7
 
     runs.fail, runs.made, probed[:] = None, [], []

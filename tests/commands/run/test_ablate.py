@@ -16,6 +16,7 @@ from bigs.commands.folder.contents import CONFIG
 from bigs.commands.run.ablate import Row, ablate, default_rows, parse_rows
 from bigs.train.plan.config_file import load_config
 from bigs.train.plan.presets import PRESETS
+from bigs.train.resolve import resolve
 
 SMOKE = PRESETS["smoke"]
 
@@ -52,7 +53,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     idle = idle_switch(SMOKE)
     found = ablate(tiny_clip, tmp_path / "out", SMOKE, ["prior+contact+smooth", idle])
     assert runs.made == ["full", "prior+contact+smooth", idle] and found.failed == []
-    assert load_config(tmp_path / "out" / "full" / CONFIG) == SMOKE
+    assert load_config(tmp_path / "out" / "full" / CONFIG) == resolve(SMOKE).config
     less = load_config(tmp_path / "out" / "prior+contact+smooth" / CONFIG)
     assert less.initial.smooth_hands == 0.0
     assert not any("contact" in stage.weights for stage in less.stages if hasattr(stage, "weights"))
@@ -128,7 +129,7 @@ def test_what_the_command_line_says(
     assert answer.code == 5
     assert "1 failed (share); the others are kept" in answer.err
     assert "datasets differ" in answer.out
-    assert load_config(out / "full" / CONFIG) == SMOKE
+    assert load_config(out / "full" / CONFIG) == resolve(SMOKE).config
     runs.fail = None
     assert call("ablate", tiny_clip, "--out", out, "--preset", "smoke", "--rows", "share,smooth").code == 0
 

@@ -25,6 +25,7 @@ from bigs.train.fit import fit
 from bigs.train.loop.checkpoint import FILE_NAME, load_checkpoint, save_checkpoint
 from bigs.train.plan.config import OptimizeStage, RunConfig
 from bigs.train.plan.presets import SMOKE
+from bigs.train.resolve import resolve
 from bigs.types import Side
 
 
@@ -35,7 +36,7 @@ def short_plan() -> RunConfig:
         for stage in copy.deepcopy(SMOKE.stages)
         if stage.name != "hands-fine"
     )
-    return replace(SMOKE, stages=stages, checkpoint_every=3)
+    return resolve(replace(SMOKE, stages=stages, checkpoint_every=3)).config
 
 
 class Interrupted(Exception):
@@ -197,7 +198,7 @@ def test_a_checkpoint_of_another_run_is_refused(
     if what == "seed":
         config = replace(config, seed=1)
     elif what == "a rate":
-        config.stages[-3].lrs["object.ray"] *= 2
+        config.stages[-1].lrs["object.ray"] *= 2
     elif what == "name":
         clip = replace(clip, name="other")
     elif what == "frame names":

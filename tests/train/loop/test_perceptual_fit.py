@@ -1,4 +1,4 @@
-"""The perceptual term in a fit: with a network it counts, without one the run says that it is off."""
+"""The perceptual term: with a network it counts, without one it is left out, and the run says so."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from bigs.hand import HandModel
 from bigs.train.fit import fit
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.presets import SMOKE
+from bigs.train.resolve import resolve
 from bigs.types import Side
 
 
@@ -35,20 +36,16 @@ def run(tiny: Clip, hands: dict[Side, HandModel], config: RunConfig, **options: 
 def test_without_a_network_the_run_says_so_once_and_goes_on(
     tiny: Clip, both_hands: dict[Side, HandModel]
 ) -> None:
-    without, report, events = run(tiny, both_hands, plan(image=1.0, perceptual=1.0))
-    (line,) = report.skipped
-    assert line == "perceptual: off in joint; --perceptual-weights FILE with VGG-16 turns it on"
-    assert [event["text"] for event in events if event["event"] == "note"] == [line]
-    assert all(event["terms"].keys() == {"image"} for event in events if event["event"] == "step")
-    never_asked, report, _ = run(tiny, both_hands, plan(image=1.0))
-    assert report.skipped == []
-    assert all(torch.equal(without[name], never_asked[name]) for name in without)
+    resolved = resolve(plan(image=1.0, perceptual=1.0))
+    assert resolved.notes == ["perceptual: off in joint; --perceptual-weights FILE with VGG-16 turns it on"]
+    assert resolved.config == plan(image=1.0)
+    assert resolve(resolved.config) == (resolved.config, None, None)
+    with pytest.raises(InputError, match="stage joint: expected a network for the term 'perceptual', found"):
+        run(tiny, both_hands, plan(image=1.0, perceptual=1.0))
 
 
-def test_a_stage_of_nothing_else_is_skipped(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
-    _, report, events = run(tiny, both_hands, plan(perceptual=1.0))
-    assert "perceptual: off in joint" in report.skipped[0]
-    assert not [event for event in events if event["event"] == "step"]
+def test_a_stage_of_nothing_else_is_left_out() -> None:
+    assert resolve(plan(perceptual=1.0)).config.stages == ()
 
 
 def test_with_a_network_it_counts(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
@@ -62,9 +59,10 @@ def test_with_a_network_it_counts(tiny: Clip, both_hands: dict[Side, HandModel])
     assert any(not torch.equal(with_it[name], without[name]) for name in without)
 
 
-def test_a_network_that_no_stage_asks_for_is_told(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
-    _, report, _ = run(tiny, both_hands, plan(image=1.0), perceptual=small_network())
-    assert report.skipped == [
+def test_a_network_that_no_stage_asks_for_is_told() -> None:
+    config = replace(plan(image=1.0), perceptual_weights=("vgg16.pth",))
+    assert resolve(config).config == config
+    assert resolve(config).notes == [
         "perceptual: a network was given, but no stage has the term (--set stages.NAME.weights.perceptual=1)"
     ]
 
@@ -80,6 +78,5 @@ def test_another_network_is_another_run(
     )
     assert [event["event"] for event in events] == ["resume"]
     assert all(torch.equal(first[name], again[name]) for name in first)
-    for other in (small_network(1), None):
-        with pytest.raises(InputError, match="found one of another run"):
-            run(tiny, both_hands, config, perceptual=other, checkpoints=tmp_path, resume=True)
+    with pytest.raises(InputError, match="found one of another run"):
+        run(tiny, both_hands, config, perceptual=small_network(1), checkpoints=tmp_path, resume=True)

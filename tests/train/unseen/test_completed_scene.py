@@ -20,6 +20,7 @@ from bigs.train.fit import FitReport, fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.plan.config import CompletionStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
+from bigs.train.resolve import resolve
 from bigs.train.start.completion import CompletionConfig
 from bigs.train.start.initial import InitialConfig
 from bigs.train.unseen.completed_scene import blended_colors
@@ -48,7 +49,7 @@ def bottle(
 def plain(
     bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
 ) -> tuple[Scene, FitReport]:
-    return fit(bottle[0], both_hands, replace(PLAN, prior=PriorConfig("off")))
+    return fit(bottle[0], both_hands, resolve(replace(PLAN, prior=PriorConfig("off"))).config)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from bigs.train.fit import FitReport, fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.plan.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import PRESETS, SMOKE
+from bigs.train.resolve import resolve
 from bigs.train.unseen.seen import SHOWS, image_error, overflow, weights_in_pictures
 from bigs.types import Side
 
@@ -147,12 +148,15 @@ def test_an_object_without_a_split_is_taken_out_of_its_field(
 
 
 def test_without_weights_one_line_says_so(one_side: Clip, both_hands: dict[Side, HandModel]) -> None:
-    _, report = run(one_side, both_hands, replace(PLAN, prior=PriorConfig("symmetry")), None)
-    about = [line for line in report.skipped if "prior" in line]
-    assert len(about) == 1 and "--prior-weights" in about[0]
-    assert STAGE.name not in report.seconds
-    _, silent = run(one_side, both_hands, PLAN, None)
-    assert silent.skipped == []
+    resolved = resolve(replace(PLAN, prior=PriorConfig("symmetry")))
+    (note,) = resolved.notes
+    assert "prior" in note and "--prior-weights" in note
+    assert STAGE not in resolved.config.stages
+    assert resolve(resolved.config) == resolved
+    for silent in (resolve(PLAN), resolve(replace(PLAN, prior=PriorConfig("symmetry")), has_object=False)):
+        assert silent.notes == [] and silent.config.stages == resolved.config.stages
+    with pytest.raises(InputError, match="stage object-prior: expected a prior's model, found none"):
+        run(one_side, both_hands, PLAN, None)
 
 
 def test_an_object_that_was_seen_is_skipped(
