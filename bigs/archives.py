@@ -41,7 +41,7 @@ _HEADERS = {
 
 
 def open_zip(where: str, stream: BinaryIO, what: str = "a zip file") -> zipfile.ZipFile:
-    """A zip archive none of whose members is larger than it may be.
+    """Open a zip archive after checking the size of every member.
 
     Args:
         where: what to call it in messages, usually its path.
@@ -75,7 +75,7 @@ def open_zip(where: str, stream: BinaryIO, what: str = "a zip file") -> zipfile.
 
 
 def read_member(where: str, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """A member of an archive from `open_zip`: never more bytes than were announced.
+    """Read a member of an archive from `open_zip`: never more bytes than announced.
 
     Raises:
         InputError: it is damaged or encrypted.

@@ -15,10 +15,10 @@ _PART = ".part"
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes the place of `path` when the block ends without an exception.
+    """Open a file that replaces `path` when the block ends without an exception.
 
-    Killed at any instant, `path` holds its old content or the new one, never a part of it. What a killed
-    writer left beside it goes with `remove_parts`.
+    If the process is killed, `path` holds its old content or the new one, never a part of it. `remove_parts`
+    removes what a killed writer left behind.
 
     Raises:
         OSError: the folder is missing or not writable, or the disk is full; `path` is as before.
@@ -38,14 +38,14 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what writers that were killed left in `folder` and below; nobody else may be writing there."""
+    """Remove what killed writers left in `folder` and below; nobody else may be writing there."""
     for path in folder.rglob(f".*{_PART}"):
         path.unlink(missing_ok=True)
 
 
 @contextmanager
 def named_errors(path: str | Path) -> Iterator[None]:
-    """Give an `OSError` that names no file, as that of a full disk, the name of the one being written."""
+    """Add the name of the written file to an `OSError` without one, such as that of a full disk."""
     try:
         yield
     except OSError as error:

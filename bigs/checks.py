@@ -48,7 +48,7 @@ _MOST_NEIGHBOURS = 1000
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong. The message is one sentence for the user; no traceback is needed."""
+    """The user's input is wrong. The message is one sentence; no traceback is needed."""
 
 
 def check_shape(name: str, array: Any, shape: Sequence[int | str | None]) -> None:
@@ -116,7 +116,7 @@ def check_pixels(name: str, width: int, height: int, most: int = MAX_PIXELS) -> 
 
 
 def check_product(name: str, frames: int, verts: int, most: int = MAX_MOVED_VERTICES) -> None:
-    """Raise `InputError` unless a mesh of `verts` vertices can be kept in each of `frames` frames."""
+    """Raise `InputError` if `frames` frames of a mesh of `verts` vertices are too many to keep."""
     if frames * verts > most:
         raise InputError(
             f"{name}: expected at most {most} vertices in all frames, found {frames} frames of {verts}"
@@ -124,7 +124,7 @@ def check_product(name: str, frames: int, verts: int, most: int = MAX_MOVED_VERT
 
 
 def shown(value: Any) -> str:
-    """Somebody else's value for a message: one line, short, and without an exception whatever it is.
+    """Show a foreign value in a message: one short line, and never an exception.
 
     Python itself refuses to print integers of more than 4300 digits, and runs out of stack where lists are
     nested deeply.
@@ -156,7 +156,7 @@ def check_choice(name: str, value: Any, choices: Iterable[Any], kind: str = "nam
 
 
 def expected_among(value: Any, choices: Iterable[Any], kind: str = "names") -> str:
-    """What a sentence says of a value that is none of the choices: what was expected, found, and meant."""
+    """The part of a message on a value that is none of the choices: expected, found, and a suggestion."""
     names = [str(choice) for choice in choices]
     near = nearest(value, names)
     recited = ", ".join(names) if len(names) <= _MOST_RECITED or not near else f"{len(names)} {kind}"
@@ -164,7 +164,7 @@ def expected_among(value: Any, choices: Iterable[Any], kind: str = "names") -> s
 
 
 def nearest(value: Any, choices: Iterable[Any]) -> str | None:
-    """The choice that was probably meant; None when none is alike."""
+    """The most similar choice, or None."""
     names = {str(choice).lower(): str(choice) for choice in choices}
     word = shown(value).strip("'\"").lower()
     found = difflib.get_close_matches(word, names, 1, _ALIKE)
@@ -174,20 +174,19 @@ def nearest(value: Any, choices: Iterable[Any]) -> str | None:
 
 
 def meant(name: str | None) -> str:
-    """The end of a sentence that asks whether `name` was meant; empty for None."""
+    """A suggestion of `name` for the end of a sentence; empty for None."""
     return "" if name is None else f"; did you mean {name}?"
 
 
 def found_at(path: Path) -> str:
-    """What lies at a path where something else was expected: "a file", "a folder", or "nothing" with
-    the neighbour that was probably meant."""
+    """What is at a path: "a file", "a folder", or "nothing" with a suggestion of a similar name."""
     if path.is_dir():
         return "a folder"
     return "a file" if path.exists() else f"nothing{meant(neighbour(path))}"
 
 
 def neighbour(path: str | Path) -> str | None:
-    """The file or folder beside a missing one that was probably meant."""
+    """The file or folder beside a missing one with the most similar name."""
     folder = Path(path).parent
     try:
         near = nearest(Path(path).name, [entry.name for entry in islice(folder.iterdir(), _MOST_NEIGHBOURS)])

@@ -1,4 +1,4 @@
-"""A checksum of tensors and of the text beside them, by which a file with a changed bit is told."""
+"""A checksum of tensors and text, which reveals a changed bit in a file."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Opening files that somebody else made: regular ones of a bounded size, whole or not at all.
+"""Open other people's files: regular ones of a bounded size.
 
-A pipe, a device or a folder can stand wherever a file is expected, and would keep a reader waiting or reading
-for ever. Everything that is read enters through here, or is looked at by `check_regular` before a library
-opens it by its path.
+A pipe or a device in place of a file would keep a reader waiting or reading for ever. All input is opened
+here, or checked by `check_regular` before a library opens it by its path.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def open_regular(path: str | Path, what: str, most: int = MAX_FILE_BYTES) -> Bin
 
 
 def check_regular(path: str | Path, what: str, most: int = MAX_FILE_BYTES) -> None:
-    """Refuse what `open_regular` refuses; for files that a library opens by their path.
+    """Check like `open_regular`, for files that a library opens by their path.
 
     Raises:
         InputError: as `open_regular`.
@@ -93,7 +92,7 @@ def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: str | Path, what: str = "a JSON file") -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
         InputError: as `read_text`, or no JSON, nested deeper than `MAX_DEPTH`, or with absurd numbers.
@@ -102,7 +101,7 @@ def read_json(path: str | Path, what: str = "a JSON file") -> Any:
 
 
 def read_yaml(path: str | Path, what: str = "a YAML file") -> Any:
-    """What a YAML file holds: plain data, whose aliases have been counted.
+    """Read a YAML file: plain data with a bounded number of aliases.
 
     Raises:
         InputError: as `read_text` and `parse_yaml`.
@@ -148,7 +147,7 @@ _YamlLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def _check_yaml(where: str, text: str) -> None:
-    """Walk over the events of a document, which takes no memory, and count what it would unfold to."""
+    """Count what a document would unfold to by walking over its events, which takes no memory."""
     sizes: dict[str, int] = {}  # number of nodes that each anchor stands for
     open_nodes: list[tuple[str | None, int]] = []  # anchor, and nodes counted before it began
     count = 0
@@ -178,7 +177,7 @@ def _check_yaml(where: str, text: str) -> None:
 
 
 def _check_values(where: str, document: Any) -> None:
-    """Refuse what nests too deep or has absurd numbers. Level by level: recursion has its limit, too."""
+    """Refuse deep nesting and absurd numbers, level by level since recursion has its own limit."""
     level, depth = [document], 0
     while level:
         below: list[Any] = []

@@ -1,4 +1,4 @@
-"""Names that come from a file and become names of files: one plain component each, on any system."""
+"""Names from a file that become file names: one plain component each, on any system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9Â
 
 
 def check_name(where: str, name: Any) -> str:
-    """`name` if it can name a file in any folder and lead nowhere else.
+    """Return `name` if it is a plain file name on any system.
 
     Args:
         where: file and field, for the message.
@@ -36,9 +36,9 @@ def check_name(where: str, name: Any) -> str:
 
 
 def check_path(where: str, path: Any) -> str:
-    """`path` if it can be looked up: text without control characters, whose parts are not too long.
+    """Return `path` if it can be opened: text without control characters, with parts of legal length.
 
-    Unlike a name it may lead anywhere; use it for what is only read, and where the user says what.
+    Unlike a name it may lead anywhere; use it for input that the user chooses.
 
     Raises:
         InputError: it cannot.
@@ -54,7 +54,7 @@ def check_path(where: str, path: Any) -> str:
 
 
 def check_inside(where: str, path: Any) -> Path:
-    """`path` if it leads from a folder to what lies in it: plain names with `/` between them.
+    """Return `path` if it stays below its folder: plain names with `/` between them.
 
     Raises:
         InputError: it leads elsewhere, or a part is no plain name.
@@ -70,7 +70,7 @@ def check_inside(where: str, path: Any) -> Path:
 
 
 def _text_reason(text: Any) -> str:
-    """Why a value is no text that a file system takes; empty if it is."""
+    """Why a file system would refuse a value as text; empty if it would not."""
     if not isinstance(text, str):
         return f"{type(text).__name__}, not text"
     if not text:

@@ -79,7 +79,7 @@ TENSORS: frozenset[Global] = ARRAYS | {
 
 
 class Refused(pickle.UnpicklingError):
-    """A global that is not on the list; the message is its name."""
+    """A global that is not allowed; the message is its name."""
 
 
 class Record:
@@ -150,7 +150,7 @@ class _RecordingUnpickler(pickle.Unpickler):
 
 
 class _Part(NamedTuple):
-    """Of a value on the stack what hashing it takes."""
+    """The cost of hashing a value on the stack."""
 
     values: int = 1  # with everything shared written out
     depth: int = 0
@@ -162,7 +162,7 @@ _TUPLES = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "FROZENSET")
 
 
 class _Rehearsal:
-    """A walk over a program before it is run, with counts in the place of values.
+    """Walks over a program before it runs, with counts instead of values.
 
     Tuples and frozen sets are the only values that are hashed with what they hold, and they never change, so
     that what is counted when one is made stays true.
@@ -222,7 +222,7 @@ class _Rehearsal:
                 stack += [_PLAIN] * len(opcode.stack_after)
 
     def _popped(self, opcode: pickletools.OpcodeInfo) -> list[_Part]:
-        """What an operation takes off the stack: down to the last mark, or so many values."""
+        """The values that an operation pops: down to the last mark, or this many."""
         stack, before = self._stack, opcode.stack_before
         if pickletools.markobject not in before:
             parts = [stack.pop() or _PLAIN for _ in before]

@@ -67,7 +67,7 @@ def load_torch(where: str, stream: BinaryIO, what: str) -> Any:
 
 
 class _Announced(NamedTuple):
-    """What a pickle says of data that lies beside it."""
+    """A pickle's description of data beside it."""
 
     key: str
     dtype: torch.dtype

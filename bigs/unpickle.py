@@ -133,7 +133,7 @@ class Builder:
         return result
 
     def spend(self, count: int) -> None:
-        """Take note of bytes that are about to be made, or have just been.
+        """Count bytes that are about to be allocated, or have just been.
 
         Raises:
             ValueError: they are out of proportion to the file.
@@ -187,7 +187,7 @@ class Builder:
         raise TypeError(f"{what} where data should be")
 
     def record(self, record: Record) -> Any:
-        """What a record stands for."""
+        """The value that a record stands for."""
         if record.key == ("copyreg", "_reconstructor"):
             state, (cls, *_) = record.state, record.args
             if not (isinstance(cls, type) and issubclass(cls, Record)):

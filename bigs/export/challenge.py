@@ -259,7 +259,7 @@ def _shapes(
 
 
 def _check(where: str, content: Mapping[str, Any]) -> None:
-    """What is there fits: names, shapes, finite values, faces in range, points relative to their roots."""
+    """Check the content: names, shapes, finite values, faces in range, points relative to their roots."""
     for key, kind in (("fnames", list), ("full_seq_name", str)):
         if not isinstance(content.get(key), kind):
             raise InputError(f"{where}: {key}: expected a {kind.__name__}, found {shown(content.get(key))}")

@@ -95,7 +95,7 @@ def load_poses(path: str | Path) -> ClipPoses:
 
 
 def _check(where: str, arrays: dict[str, np.ndarray]) -> None:
-    """Every field that belongs there is there, fits, and is finite."""
+    """Check that every field exists, has its shape, and is finite."""
     if "frame_names" not in arrays:
         raise InputError(f"{where}: expected a field frame_names, found {', '.join(arrays)}")
     check_shape(f"{where}: frame_names", arrays["frame_names"], ("T",))

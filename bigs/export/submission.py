@@ -1,6 +1,6 @@
-"""`arctic_preds.zip`, what the ARCTIC bimanual category-agnostic challenge is sent: a file per sequence.
+"""`arctic_preds.zip`, the submission to the ARCTIC bimanual category-agnostic challenge: a file per sequence.
 
-The server names no mistake, answers after hours and seldom, so everything that it reads is checked here.
+The server reports no mistakes and answers after hours, so everything that it reads is checked here.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def _check_archive(where: str, stream: BinaryIO, sequences: Sequence[str]) -> li
 
 
 def _check_names(where: str, names: Sequence[str], sequences: Sequence[str]) -> None:
-    """Exactly these sequences, each once."""
+    """Check that the files are exactly these sequences, each once."""
     missing = [name for name in sequences if name not in names]
     if missing:
         raise InputError(

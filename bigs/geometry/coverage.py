@@ -1,4 +1,4 @@
-"""Which parts of an object's surface a clip has seen, and from which directions it is known."""
+"""Which parts of an object's surface a clip has seen, and from which directions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CLOSED = 2
 
 @dataclass(frozen=True)
 class ObjectViews:
-    """Where the object's own pixels are in each frame, and the pose it had there."""
+    """The object's pixels in each frame, and its pose there."""
 
     shown: np.ndarray  # [T, H, W] bool: nothing hides the object here
     K: np.ndarray  # [3, 3] intrinsics

@@ -1,4 +1,4 @@
-"""A signed distance field on a grid, sampled with gradients: how far is a hand's vertex from the object."""
+"""A signed distance field on a grid, sampled with gradients."""
 
 from __future__ import annotations
 

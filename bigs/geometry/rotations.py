@@ -1,4 +1,4 @@
-"""The one place where rotations change form. Matrices act on column vectors; quaternions are w x y z.
+"""All conversions of rotations. Matrices act on column vectors; quaternions are w x y z.
 
 The two conversions that every step of an optimisation makes many times are written as few operations on small
 tensors, since each costs as much as its arithmetic; the others are kornia's. Gradients are finite at the

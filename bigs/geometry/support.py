@@ -1,4 +1,4 @@
-"""What of the object's closed surface the clip speaks for: where nothing does, the closure is a guess."""
+"""Which part of the object's closed surface the clip supports; the rest is a guess."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def seen_samples(
 
 
 class Support:
-    """How far places are from anything that the clip shows of the object."""
+    """Distance of points from anything that the clip shows of the object."""
 
     def __init__(self, samples: SurfaceSamples, points: np.ndarray) -> None:
         """`points` [M, 3] are the clip's own, metres; at least one of them, or one seen sample."""
@@ -58,7 +58,7 @@ class Support:
         return float((self._of_sample >= reach).mean())
 
     def known_part(self, verts: np.ndarray, faces: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Of a mesh, what lies within `reach` metres of what is shown.
+        """The part of a mesh that lies within `reach` metres of what is shown.
 
         Returns:
             Indices of its vertices, and faces among these.

@@ -52,7 +52,7 @@ class SymmetryConfig:
 def find_symmetries(
     surface: SeenSurface, is_empty: IsEmpty, config: SymmetryConfig = SymmetryConfig()
 ) -> list[Symmetry]:
-    """The symmetries for which the evidence is strong, in the order in which they were found; often none.
+    """The symmetries with strong evidence, in the order in which they were found; often none.
 
     After each one the search begins anew on the surface that it completes: what was seen of one side of a box
     says nothing about its back, what two sides say together does.
@@ -120,7 +120,7 @@ class _Judge:
         return support - 3.0 * contradiction
 
     def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
-        """The candidate, refined, for which most speaks; None if that is not enough."""
+        """The refined candidate with the strongest evidence; None if that is not enough."""
         ranked = sorted(candidates, key=self.worth, reverse=True)[:_FINALISTS]
         refined: list[Symmetry] = []
         for symmetry in sorted(map(self._refined, ranked), key=self.worth, reverse=True):
@@ -168,7 +168,7 @@ class _Judge:
         return symmetry
 
     def _polished(self, symmetry: Symmetry) -> Symmetry:
-        """The symmetry moved a little to where most speaks for it."""
+        """The symmetry moved a little to where its evidence is strongest."""
         simplex = np.vstack([np.zeros(4), np.diag([0.02, 0.02, 0.06, 0.06])])
         found = scipy.optimize.minimize(
             lambda x: -self.worth(symmetry.moved(x, self.size)),
@@ -179,7 +179,7 @@ class _Judge:
         return symmetry.moved(found.x, self.size)
 
     def _sharpness(self, symmetry: Symmetry) -> float:
-        """How much worse the least bad of some small moves is."""
+        """The smallest loss that any of some small moves causes."""
         shift, turn = 1.5 * self.config.tolerance, np.radians(5.0)
         moves = [(0.0, shift, 0.0, 0.0), (0.0, 0.0, turn, 0.0), (0.0, 0.0, 0.0, turn)]
         if symmetry.kind == "axis":

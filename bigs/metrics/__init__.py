@@ -1,1 +1,1 @@
-"""How good is it: image, pose and shape scores, as the field's evaluators define them."""
+"""Image, pose and shape scores, as the field's evaluators define them."""

@@ -1,4 +1,4 @@
-"""The few scores that say how good a run is, with what each means in plain words."""
+"""The headline scores of a run, each with a plain explanation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bigs.metrics.report import comparison_table
 
 
 class Headline(NamedTuple):
-    """A score that is shown first."""
+    """A headline score."""
 
     keys: tuple[str, ...]  # the first key that a run has is shown
     means: str
@@ -40,7 +40,7 @@ HEADLINES = (
 def headline_keys(
     scores: Mapping[str, Mapping[str, float]], told: Mapping[str, str] | None = None
 ) -> list[str]:
-    """The keys of the scores that are shown first: of each headline the first that is there or told of."""
+    """The keys of the headline scores: of each headline the first that exists or has a remark."""
     known = {key for row in scores.values() for key in row} | set(told or {})
     found = (next((key for key in headline.keys if key in known), None) for headline in HEADLINES)
     return [key for key in found if key is not None]
@@ -49,7 +49,7 @@ def headline_keys(
 def headline_table(
     scores: Mapping[str, Mapping[str, float]], told: Mapping[str, str] | None = None
 ) -> list[tuple[str, ...]]:
-    """As `comparison_table`, of the headlines alone."""
+    """`comparison_table` for the headlines alone."""
     metrics = {key: ALL_METRICS[key] for key in headline_keys(scores, told)}
     return comparison_table(scores, metrics, details=True, told=told)
 

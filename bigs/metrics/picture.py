@@ -1,4 +1,4 @@
-"""How like the truth a rendered picture is, and which of its pixels count.
+"""Similarity of rendered and true pictures, and which pixels count.
 
 Published figures rarely say what they mask. Here there are two ways, both over black: `full` compares the
 render as it is with the true image blanked outside its mask, every pixel counting, so that what spills over
@@ -93,7 +93,7 @@ def picture_scores(
 def aligned_psnr(
     renders: Mapping[str, np.ndarray], image: np.ndarray, masks: Mapping[str, np.ndarray], reach: int = 8
 ) -> float:
-    """PSNR in dB of each subject alone, after the shift that suits it best.
+    """PSNR in dB of each subject alone, after its best shift.
 
     Each subject's squared error is a mean over the pixels and channels of its mask. A shift is a whole number
     of pixels along each axis, no longer than `reach`; what it brings in from beyond the image is black.

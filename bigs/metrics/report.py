@@ -16,7 +16,7 @@ from bigs.types import SIDES, HandObjectTrajectory, Side
 
 
 class Metric(NamedTuple):
-    """How a score is read."""
+    """How to read a score."""
 
     paper: str  # its name in the paper's tables, or a plain description where the paper has none
     unit: str
@@ -84,9 +84,8 @@ def evaluate(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, 
 
 
 def remarks(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, str]:
-    """Why scores of `evaluate` are missing, or over how many frames they are, by its keys.
-
-    Nothing is said of what neither side has, nor where all frames count.
+    """Why scores of `evaluate` are missing, or the number of frames they cover, by key. Scores that need what
+    neither side has, and scores over all frames, have no remark.
     """
     found: dict[str, str] = {}
     whole = len(gt.frame_names)

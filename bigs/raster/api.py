@@ -1,4 +1,4 @@
-"""The one call: has what it is given checked, picks a backend."""
+"""The renderer's one call: checks its arguments and picks a backend."""
 
 from __future__ import annotations
 

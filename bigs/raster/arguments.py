@@ -1,4 +1,4 @@
-"""What the one call is given: that it fits together, and the sizes that follow."""
+"""Checks of the renderer's arguments, and the sizes that follow from them."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None
 
 
 class Slabs(NamedTuple):
-    """How the engine is to read the inputs, one entry for each that it takes, in its order."""
+    """How the engine reads its inputs: one entry per input, in its order."""
 
     counts: tuple[tuple[int, int], ...]
     """How many batch entries and cameras (or 1: shared) the leading axes stand for."""

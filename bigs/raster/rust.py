@@ -23,7 +23,7 @@ Means2d = Literal["values", "full", "packed"]
 
 
 class Extras(NamedTuple):
-    """What is not part of an image."""
+    """Results besides the image."""
 
     means2d: Means2d
     absgrad: bool
@@ -31,7 +31,7 @@ class Extras(NamedTuple):
 
 
 class Call(NamedTuple):
-    """What the engine is told besides the arrays."""
+    """Arguments of the engine besides the arrays."""
 
     counts: tuple[tuple[int, int], ...]
     """Of each input, how many batch entries and cameras (or 1: shared) its leading axes stand for."""

@@ -1,1 +1,1 @@
-"""Results for a person to look at: preview pictures, a video, and a report that opens offline."""
+"""Results to look at: preview pictures, a video, an offline report and the live viewer."""

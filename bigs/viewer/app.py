@@ -1,4 +1,4 @@
-"""The live viewer: a page, served on this machine, that plays a reconstruction and lets one pose it."""
+"""The live viewer: a local web page that plays a reconstruction and lets the user pose it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where a browser finds it. The port is the next free one if the wanted one is taken."""
+        """The page's address. The port is the next free one if the wanted one is taken."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def close(self) -> None:
@@ -263,7 +263,7 @@ class Viewer:
 
 
 def _check_address(host: str, port: int) -> None:
-    """Refuse an address that is not this machine's; the server would try every port of it in vain."""
+    """Refuse an address that is not this machine's; the server would try every port in vain."""
     if not 0 <= port <= _LAST_PORT:
         raise InputError(f"port: expected a number from 0 to {_LAST_PORT}, found {port}")
     try:

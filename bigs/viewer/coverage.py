@@ -1,4 +1,4 @@
-"""A map of the directions from which an object was seen: what no camera saw was guessed."""
+"""A map of the directions from which an object was seen; the rest of it is a guess."""
 
 from __future__ import annotations
 

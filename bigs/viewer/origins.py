@@ -1,7 +1,7 @@
-"""Who may talk to the live viewer: pages that it served itself, and programs; never a page of the web.
+"""Who may connect to the live viewer: its own page and programs, but no other web page.
 
-A browser lets any page open a WebSocket to this machine, and says only in `Origin` which page it was. viser
-does not look at it, so the server it starts is given a look of our own.
+A browser lets any page open a WebSocket to this machine and names the page only in `Origin`. viser does not
+check it, so bigs adds a check.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def is_own_page(origins: list[str], hosts: list[str], listening: str) -> bool:
 
 @contextlib.contextmanager
 def own_pages_only(listening: str) -> Iterator[None]:
-    """Whatever server viser starts meanwhile refuses requests of other pages, with status 403."""
+    """Servers that viser starts in the block refuse requests of other pages with status 403."""
     import websockets.asyncio.server as library
 
     serve = library.serve

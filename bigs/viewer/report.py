@@ -141,7 +141,7 @@ def write_report(
 
 
 def replace_scores(path: Path, metrics: Sequence[Sequence[str]]) -> bool:
-    """Put another table of scores into a report; False where it has no place for one.
+    """Replace the table of scores in a report; False if the report has none.
 
     Args:
         path: a file of `write_report`.

@@ -1,4 +1,4 @@
-"""What a live viewer shows, as plain arrays and functions of the frame: it knows of no model and no file."""
+"""What the live viewer shows, as plain arrays and functions of the frame, without models or files."""
 
 from __future__ import annotations
 
