@@ -40,9 +40,9 @@ _HANDS_COARSE = OptimizeStage(
     image_size=60,
     final_lr=0.5,
 )
-_HANDS_FINE = replace(
-    _HANDS_COARSE,
+_HANDS_FINE = OptimizeStage(
     name="hands-fine",
+    step="single-subject",
     steps=100,
     lrs={
         "hand.orient": 0.006,
@@ -54,24 +54,35 @@ _HANDS_FINE = replace(
     },
     weights={"silhouette": 1.0, **_POSE_PRIORS, "rigid": 0.03},
     image_size=160,
-    final_lr=0.1,
 )
 # Grasps are known: what all frames of one agree on moves together.
-_GRASP_RATES = {"hand.grasp_orient": 0.006, "hand.grasp_pose": 0.008, "hand.grasp_position": 0.001}
-_HELD = replace(
-    _HANDS_FINE,
+_HELD_RATES = {
+    "hand.orient": 0.006,
+    "hand.pose": 0.008,
+    "hand.pose_bias": 0.008,
+    "hand.ray": 0.002,
+    "hand.depth": 0.003,
+    "hand.betas": 0.01,
+    "hand.grasp_orient": 0.006,
+    "hand.grasp_pose": 0.008,
+    "hand.grasp_position": 0.001,
+}
+_HELD = OptimizeStage(
     name="held",
+    step="single-subject",
     steps=50,
-    lrs={**_HANDS_FINE.lrs, **_GRASP_RATES, "hand.betas": 0.01},
+    lrs=_HELD_RATES,
     weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0},
+    image_size=160,
     final_lr=0.3,
 )
-_CONTACT = replace(
-    _HELD,
+_CONTACT = OptimizeStage(
     name="contact",
     step="interacting-subjects",
-    weights={**_HELD.weights, "contact": 0.1, "penetration": 0.01},
-    final_lr=0.1,
+    steps=50,
+    lrs=_HELD_RATES,
+    weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0, "contact": 0.1, "penetration": 0.01},
+    image_size=160,
 )
 _APPEARANCE = OptimizeStage(
     name="appearance",
