@@ -1,4 +1,4 @@
-"""What `bigs bench engine` measures: which calls, in which processes, how often."""
+"""The measurements of `bigs bench engine`: which calls, in which processes, how often."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a result lies from the truth."""
+"""Errors of a result against the truth."""
 
 from __future__ import annotations
 

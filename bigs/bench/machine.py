@@ -15,7 +15,7 @@ _STATUS = Path("/proc/self/status")
 
 
 def machine_facts() -> dict[str, Any]:
-    """What a table of times has to say about where it was made."""
+    """Facts about the machine for a table of times."""
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "cpu": _cpu_model() or platform.processor(),

@@ -8,7 +8,7 @@ Rows = list[tuple[str, ...]]
 
 
 class Table(NamedTuple):
-    """Rows of equal length, the first being the heading, and what one has to know to read them."""
+    """Rows of equal length, the heading first, and a note on how to read them."""
 
     title: str
     note: str

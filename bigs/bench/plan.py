@@ -1,4 +1,4 @@
-"""What a run of `bigs bench engine` is asked to measure."""
+"""The options of `bigs bench engine`."""
 
 from __future__ import annotations
 

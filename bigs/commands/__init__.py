@@ -1,1 +1,1 @@
-"""What each command does, as functions: they return what there is to print and print nothing themselves."""
+"""What each command does, as functions that return what the command line prints."""

@@ -1,4 +1,4 @@
-"""What of bigs works on this machine: what is installed, what is missing, and what that would enable."""
+"""What is installed on this machine, what is missing, and what that would enable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is going on, as lines: for logs and pipes, where nothing can be drawn over."""
+"""Progress as lines, for logs and pipes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COUNT = re.compile(r"\d+")
 
 
 class Spoken:
-    """Prints a line when something begins; `remind` prints where it is when long nothing has."""
+    """Prints a line when something begins; `remind` prints the current state after a long silence."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

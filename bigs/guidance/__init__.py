@@ -1,4 +1,4 @@
-"""What a diffusion model knows about objects, as a gradient on a picture (paper Eq. 7)."""
+"""A diffusion model's opinion of a picture as a gradient (paper Eq. 7)."""
 
 from bigs.guidance.denoiser import Conditions, Denoiser, EdgeDetector, classifier_free
 from bigs.guidance.schedule import SdsConfig, timestep_range, timestep_weight

@@ -1,4 +1,4 @@
-"""What a diffusion model must offer to be a prior: latent models and pixel-space ones alike."""
+"""The interface of a diffusion model as a prior, for latent and pixel-space models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Soft edges of pictures without a network: what a ControlNet is given when there is no PiDiNet file."""
+"""Soft edges of pictures without a network, for a ControlNet without a PiDiNet file."""
 
 from __future__ import annotations
 

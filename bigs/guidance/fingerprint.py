@@ -1,4 +1,4 @@
-"""What tells one denoiser from another, wherever its files lie."""
+"""A fingerprint of a denoiser, independent of where its files lie."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians with parameters of their own: what is left of a field once it has been evaluated a last time."""
+"""Gaussians with parameters of their own, started from a field's last evaluation."""
 
 from __future__ import annotations
 

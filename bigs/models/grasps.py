@@ -16,7 +16,7 @@ from bigs.models.poses import HandFrames, ObjectFrames
 
 
 class Grasps(nn.Module):
-    """The grasps of one hand; row g of every table is grasp g. There is room for one a frame.
+    """The grasps of one hand; row g of every table is grasp g. There is room for one per frame.
 
     Rotations are those of the canonical hand, so for a left hand they are relative to the object as the
     mirror shows it; positions are in the object's own frame, metres at its initial size.

@@ -41,7 +41,7 @@ class HandDetail(FreeGaussians):
 
 @torch.no_grad()
 def free_hand(hand: HandSplats | HandDetail) -> HandDetail:
-    """The Gaussians as they are now, from here on without a field."""
+    """The Gaussians as they are now, without a field."""
     whole = hand()
     detail = HandDetail(hand.model, whole)
     # A Gaussian is thin along its third axis, the surface's outward normal.

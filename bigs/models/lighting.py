@@ -1,4 +1,4 @@
-"""Light that stands still while hands and object turn in it, and shade that comes and goes.
+"""Light that stands still while hands and object turn in it, and shade that changes.
 
 A Gaussian with one fixed colour cannot be lit from above in one frame and from below in the next. Here its
 colour is an albedo times a smooth function of the direction its surface faces in camera space: one quadratic

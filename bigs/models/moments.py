@@ -1,4 +1,4 @@
-"""The poses of some frames, each worked out once however many terms of a step ask for it."""
+"""The poses of some frames, each computed once however many loss terms ask for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The object's Gaussians on their own: what a field said, in finer parts without a field behind them."""
+"""The object's Gaussians without a field, split into finer parts."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def load_playback(path: Path) -> Playback:
 
 
 def _without_grasps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What stands for the grasps that a file of an earlier version does not tell."""
+    """Placeholders for the grasps that a file of an earlier version lacks."""
     found: dict[str, Tensor] = {}
     for side in SIDES:
         joints = tensors.get(f"{side}.joints")
@@ -113,7 +113,7 @@ def _without_grasps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Everything is there, fits together and is finite; what is more than that is refused, too."""
+    """Check that everything exists, fits together and is finite, and that there is nothing else."""
     _check_facts(where, facts)
     frames = len(facts["frame_names"])
     shapes: dict[str, Shape] = {"K": (3, 3)}
@@ -232,7 +232,7 @@ def _object_shapes(frames: int, tensors: Mapping[str, Tensor]) -> dict[str, Shap
 
 
 def _length(tensors: Mapping[str, Tensor], name: str, axis: int, unknown: str) -> int | str:
-    """How many there are, or any number where the tensor that tells is not there or has no such axis."""
+    """The size of an axis, or any number if the tensor or the axis is missing."""
     stored = tensors.get(name)
     return unknown if stored is None or stored.ndim <= axis else stored.shape[axis]
 

@@ -1,1 +1,1 @@
-"""Many clips: the manifest, the engines that work on it, and each job."""
+"""Many clips: the manifest, the engines that run it, and each job."""

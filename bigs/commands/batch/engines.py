@@ -1,6 +1,6 @@
-"""Where the clips of a batch are worked on: processes here, a Slurm cluster, a Ray cluster.
+"""Engines that run the clips of a batch: local processes, a Slurm cluster, a Ray cluster.
 
-An engine takes jobs and says which has ended and how; what to do next is `run_batch.py`'s business.
+An engine takes jobs and reports how each ended; `run_batch.py` decides what to do next.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ class Engine(Protocol):
     def submit(self, job: Job) -> None: ...
 
     def next_ended(self) -> tuple[Job, str]:
-        """Wait for a job to end: which one, and how its worker died; "" if it did not."""
+        """Wait for a job to end; returns the job and how its worker died, or ""."""
         ...
 
     def close(self) -> None:
-        """Stop what still runs."""
+        """Stop all running jobs."""
         ...
 
 
 class Processes:
-    """One new process for each attempt, so that one that dies takes nothing with it."""
+    """A new process for each attempt, so that a crash affects nothing else."""
 
     def __init__(self) -> None:
         # Not forked: torch's and the engine's threads do not survive a fork.
@@ -67,7 +67,7 @@ class Processes:
 
 
 class SlurmJobs:
-    """Slurm by way of submitit, whose own files go to `folder`.
+    """Slurm through submitit, whose own files go to `folder`.
 
     Args:
         folder: shared with the nodes.
@@ -178,7 +178,7 @@ def _death(code: int | None) -> str:
 
 
 def _notice(error: BaseException) -> str:
-    """A scheduler's notice of a death, of which some are pages long, as one of ours."""
+    """A short version of a scheduler's report of a dead worker."""
     sentence = " ".join(str(error).split()).partition(". ")[0].rstrip(".")
     reason = sentence if len(sentence) <= _LONGEST_NOTICE else type(error).__name__
     return f"its worker was killed or crashed ({reason or type(error).__name__})"

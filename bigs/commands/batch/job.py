@@ -1,4 +1,4 @@
-"""One clip of a batch, tried once: what every engine runs, and the status that it leaves behind."""
+"""One attempt at one clip of a batch, as every engine runs it, and the status that it leaves."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Status:
-    """How far a clip is; `status.json` in its folder."""
+    """The state of a clip; `status.json` in its folder."""
 
     state: State = "waiting"
     attempts: int = 0  # in this call of the batch command
@@ -55,7 +55,7 @@ class Status:
 
 
 def read_status(folder: Path) -> Status:
-    """The status of a clip; "waiting" where there is none, or none that can be read."""
+    """The status of a clip; "waiting" if there is none that can be read."""
     try:
         stored = read_json(folder / STATUS)
         return Status(**{name.name: stored[name.name] for name in fields(Status)})
@@ -68,15 +68,15 @@ def write_status(folder: Path, status: Status) -> None:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the clip is done: it says so and the result is there."""
+    """Whether the clip is finished and its result exists."""
     return read_status(folder).state == "finished" and (folder / SCENE).is_file()
 
 
 def run_job(job: Job) -> None:
-    """Reconstruct one clip, or go on where an earlier attempt was interrupted; never again once finished.
+    """Reconstruct one clip, or continue an interrupted attempt; a finished clip is left alone.
 
-    Nothing is raised for what goes wrong with the clip: `status.json` says how it ended, and the clip's
-    `batch.log` has one line for each event and the traceback of a failure.
+    Errors of the clip are not raised: `status.json` says how it ended, and the clip's `batch.log` has one
+    line for each event and the traceback of a failure.
     """
     folder = job.run.folder
     if is_finished(folder):

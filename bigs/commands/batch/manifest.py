@@ -20,7 +20,7 @@ _SEPARATOR = ";"
 
 @dataclass(frozen=True)
 class Entry:
-    """One clip of a batch; None and () are what the batch has for all."""
+    """One clip of a batch; None and () stand for the batch's own options."""
 
     clip: Path
     name: str = ""  # name of the folder
@@ -40,9 +40,10 @@ _LISTS = ("set", "without")
 def read_manifest(path: Path) -> list[Entry]:
     """The clips of a manifest, each with a name of its own.
 
-    A text file has a clip a line. A CSV file has a heading with `clip` and any of the other fields; several
-    values of a cell are separated by semicolons. YAML and JSON have a list of paths or of mappings, or a
-    mapping with `clips` (such a list) and `defaults` (fields for all). Paths are relative to the manifest.
+    A text file has one clip per line. A CSV file has a heading with `clip` and any of the other fields;
+    several values of a cell are separated by semicolons. YAML and JSON have a list of paths or of mappings,
+    or a mapping with `clips` (such a list) and `defaults` (fields for all). Paths are relative to the
+    manifest.
 
     Raises:
         InputError: no such file, another suffix, an unknown field, a value of another kind, no clip, or a
@@ -120,7 +121,7 @@ def _entry(where: str, row: Any, folder: Path) -> Entry:
 
 
 def _named(path: Path, entries: Sequence[Entry]) -> list[Entry]:
-    """Entries without a name get that of their clip's folder, with a number where it comes again."""
+    """Name entries without a name after their clip's folder, with a number if it repeats."""
     given = [entry.name for entry in entries if entry.name]
     for name in given:
         if given.count(name) > 1:

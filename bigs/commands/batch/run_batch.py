@@ -1,4 +1,4 @@
-"""Many clips: planned, worked on by an engine, tried again where that can help, and summed up."""
+"""Many clips: planned, run by an engine, retried where that can help, and summarised."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class BatchResult:
 def plan_batch(
     entries: Sequence[Entry], out: Path, config_of: Callable[[Entry], RunConfig], hand_model: Path | None
 ) -> list[PlannedRun]:
-    """A run for each entry; whether a clip is as it should be is found when it is its turn.
+    """Plan a run for each entry; each clip is checked when its turn comes.
 
     Raises:
         InputError: settings that cannot be, or a folder that holds a run of another clip or configuration.
@@ -83,7 +83,7 @@ def run_batch(
     at_once: int,
     listen: Listener = lambda text: None,
 ) -> BatchResult:
-    """Work on every clip of the plan that is not finished. The summary is written anew after each.
+    """Run every unfinished clip of the plan. The summary is written anew after each.
 
     A clip that fails, or whose worker is killed, is tried again as often as the plan says and goes on from
     its last checkpoint; one whose files are refused is not. None of them stops another.

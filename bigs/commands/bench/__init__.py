@@ -1,1 +1,1 @@
-"""`bigs bench`: each measurement, and the harder clips that some of them are made on."""
+"""`bigs bench`: each measurement, and the harder clips that some of them use."""

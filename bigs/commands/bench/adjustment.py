@@ -1,4 +1,4 @@
-"""What bundle adjustment costs against points, frames, and how many frames see a point."""
+"""Cost of bundle adjustment against points, frames, and how many frames see a point."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NOISE = 0.2  # pixels
 
 @dataclass(frozen=True)
 class AdjustmentPlan:
-    """What `bigs bench adjustment` is asked to measure."""
+    """The options of `bigs bench adjustment`."""
 
     frames: tuple[int, ...] = (60, 300)
     points: tuple[int, ...] = (1000, 7000)

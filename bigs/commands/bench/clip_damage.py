@@ -1,4 +1,4 @@
-"""Clips with estimates as careless capture leaves them: worse masks, pictures, poses and camera."""
+"""Clips as careless capture leaves them: worse masks, pictures, poses and camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Object motion from tracks on clips with ground truth, from the poses that they come with and from worse."""
+"""Object motion from tracks on clips with ground truth, from their own poses and from worse ones."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _GROSS = 60.0  # degrees
 
 @dataclass(frozen=True)
 class MotionPlan:
-    """What `bigs bench motion` is asked to measure."""
+    """The options of `bigs bench motion`."""
 
     clips: tuple[Path, ...]
     variants: tuple[str, ...] = tuple(VARIANTS)

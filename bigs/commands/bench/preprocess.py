@@ -1,4 +1,4 @@
-"""Preprocessing on clips with ground truth and on harder variants: what is right, and what is flagged."""
+"""Preprocessing on clips with ground truth and on harder variants: errors and flags."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _SCORES = {
 
 @dataclass(frozen=True)
 class PreprocessPlan:
-    """What `bigs bench preprocess` is asked to measure."""
+    """The options of `bigs bench preprocess`."""
 
     clips: tuple[Path, ...]
     variants: tuple[str, ...] = tuple(VARIANTS)

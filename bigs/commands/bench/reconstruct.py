@@ -1,4 +1,4 @@
-"""Presets and switches over clips: what they cost, what they reach, and where the time goes."""
+"""Presets and switches over clips: time, errors, and where the time goes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ GROWTH = "growth"
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What `bigs bench reconstruct` is asked to measure."""
+    """The options of `bigs bench reconstruct`."""
 
     clips: tuple[Path, ...]
     presets: tuple[str, ...] = ("fast",)
@@ -101,7 +101,7 @@ def variants(plan: RunPlan) -> list[Variant]:
 
 
 def clip_names(clips: tuple[Path, ...]) -> list[str]:
-    """What the clips are called: their folders' names.
+    """The clips' names, which are those of their folders.
 
     Raises:
         InputError: none, or two of one name.
@@ -121,7 +121,7 @@ def clip_names(clips: tuple[Path, ...]) -> list[str]:
 def bench_reconstruct(
     plan: RunPlan, out: Path, *, picture: bool = True, listen: Callable[[str], None] = lambda text: None
 ) -> RunBench:
-    """Measure into a folder; what it holds of an earlier call is not run again.
+    """Measure into a folder; runs of an earlier call are kept.
 
     Args:
         plan: what to run.
@@ -214,7 +214,7 @@ def bench_reconstruct(
 
 
 def _stored(path: Path, key: dict[str, Any]) -> dict[str, Any] | None:
-    """What an earlier call has measured of the same thing."""
+    """Measurements of an earlier call."""
     try:
         stored = read_json(path)
     except InputError:

@@ -1,4 +1,4 @@
-"""How much worse a reconstruction gets when its clip is worse: `bigs bench robustness`."""
+"""How much a reconstruction suffers from a damaged clip: `bigs bench robustness`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ERRORS = tuple(key for _, key, _ in _SCORES if ALL_METRICS[key].better == "lowe
 
 @dataclass(frozen=True)
 class RobustnessPlan:
-    """What `bigs bench robustness` is asked to measure."""
+    """The options of `bigs bench robustness`."""
 
     clips: tuple[Path, ...]
     damages: tuple[str, ...] = tuple(DAMAGES)
@@ -56,7 +56,7 @@ class RobustnessBench:
 def bench_robustness(
     plan: RobustnessPlan, out: Path, listen: Callable[[str], None] = lambda text: None
 ) -> RobustnessBench:
-    """Reconstruct clips as they are and damaged, and score all of it on the clips as they are.
+    """Reconstruct clips as they are and damaged, and score all runs against the clean clips.
 
     Args:
         plan: what to run.

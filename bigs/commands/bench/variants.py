@@ -1,4 +1,4 @@
-"""Variants of a clip with ground truth that are harder to preprocess: what a user would bring of each."""
+"""Variants of a clip with ground truth that are harder to preprocess."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Clips as commands take them: opened, described, converted, and the truth beside them."""
+"""Clips for commands: opened, described, converted, and their ground truth."""

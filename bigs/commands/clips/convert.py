@@ -1,4 +1,4 @@
-"""Clips of any layout as the one that a reconstruction starts from, HOLD's build folder, with their truth."""
+"""Conversion of clips of any layout, with their ground truth, into HOLD's build folder."""
 
 from __future__ import annotations
 

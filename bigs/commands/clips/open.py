@@ -1,4 +1,4 @@
-"""Clips as commands take them: of any layout, and with estimates where a reconstruction starts from them."""
+"""Clips for commands: of any layout, and with estimates if a reconstruction starts from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bigs.types import Side
 
 
 def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
-    """A clip of any layout that `bigs.data.layouts` knows, single faults taken out and noted.
+    """A clip of any layout that `bigs.data.layouts` knows, with single faults repaired and noted.
 
     Raises:
         InputError: the clip is not as it should be, or cannot be of hands before a camera.

@@ -1,4 +1,4 @@
-"""How a reconstruction's pictures score: on the clip's own frames, and from views held back."""
+"""Image scores of a reconstruction: on the clip's own frames and in held-out views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scores of finished runs: against ground truth, on the clip's own frames, and from views held back."""
+"""Scores of finished runs: against ground truth, on the clip's own frames, and in held-out views."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ OFFICIAL_NOTES = (
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What a run is scored with; what is not given is taken from the run's own clip, where that is there."""
+    """What to score a run with; missing parts come from the run's own clip, if it exists."""
 
     ground_truth: Path | None = None  # see `load_truth`
     clip: Path | None = None  # for its images and masks
@@ -80,11 +80,11 @@ class Evaluation:
         return comparison_table(self.scores, ALL_METRICS, details=True, told=self.told)
 
     def headlines(self) -> list[tuple[str, ...]]:
-        """The few that are shown first."""
+        """The headline scores."""
         return headline_table(self.scores, self.told)
 
     def meanings(self) -> list[str]:
-        """What those mean, a line each."""
+        """A line of explanation for each headline."""
         return headline_meanings(self.scores, self.told)
 
 
@@ -179,7 +179,7 @@ def _input_of(playback: Playback, truth: Path | None, clip: Path | None) -> RunI
 
 
 def run_names(runs: Sequence[Path]) -> list[str]:
-    """What runs are called in a table: their folders' names, or the paths where those are not enough.
+    """Names of runs in a table: those of their folders, or the paths if these repeat.
 
     Raises:
         InputError: a folder comes twice.
@@ -214,7 +214,7 @@ def compare_runs(runs: Mapping[str, Evaluation], out: Path) -> list[Table]:
 
 
 def _told_once(told: Mapping[str, str]) -> list[str]:
-    """What is told of scores, each thing once, with the scores that it is told of."""
+    """Remarks on scores, each once, with the scores that it concerns."""
     lines = []
     for text in dict.fromkeys(told.values()):
         names = [ALL_METRICS[key].paper for key in told if told[key] == text]
@@ -255,7 +255,7 @@ def _open_frames(
 
 
 def _own_novel(clip_path: Path | None) -> Path | None:
-    """The views held back of a clip, beside its build folder."""
+    """A clip's held-out views, beside its build folder."""
     if clip_path is None:
         return None
     folder = (clip_path.parent if clip_path.name == "build" else clip_path) / "novel"

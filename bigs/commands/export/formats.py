@@ -1,4 +1,4 @@
-"""A finished scene in every format that it can be taken away in."""
+"""A finished scene in every export format."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FPS = 30.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a scene to write."""
+    """What to write of a scene."""
 
     frames: tuple[int, ...] | None = None  # the times that are wanted; None is the format's own choice
     clip: Clip | None = None  # for formats that hold the input images
@@ -61,7 +61,7 @@ def write_format(folder: Path, playback: Playback, name: str, choice: Choice = C
 
 
 def check_format(playback: Playback, name: str, choice: Choice) -> None:
-    """What `write_format` can know before it writes.
+    """Check what `write_format` can know before it writes.
 
     Raises:
         InputError: unknown format, or frames that the clip has not or the format does not take.

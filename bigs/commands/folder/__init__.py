@@ -1,1 +1,1 @@
-"""The folder of a run: what lies where, who writes it, and what it was made from."""
+"""The folder of a run: its files, who writes it, and what it was made from."""

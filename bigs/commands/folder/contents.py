@@ -1,4 +1,4 @@
-"""The folder of a run: what lies where."""
+"""The files of a run folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load_run(run: Path) -> Playback:
 
 
 def read_scores(run: Path) -> dict[str, dict[str, float]]:
-    """What a run's `metrics.json` says: scores by key, of the result and of what it began with.
+    """The content of a run's `metrics.json`: scores by key, of the result and of the start.
 
     Returns:
         Nothing where there is no such file.

@@ -1,4 +1,4 @@
-"""One writer per run folder: two that resume the same run would undo each other's work."""
+"""One writer per run folder: two that resume the same run would overwrite each other."""
 
 from __future__ import annotations
 

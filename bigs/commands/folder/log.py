@@ -1,4 +1,4 @@
-"""log.jsonl: what happened in a run, one event per line, in the order in which it counts."""
+"""log.jsonl: what happened in a run, one event per line."""
 
 from __future__ import annotations
 

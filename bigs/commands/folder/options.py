@@ -1,4 +1,4 @@
-"""What a run was begun with and what it is to be continued with: which option differs, old value and new."""
+"""The options of an interrupted run against those it is resumed with."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ABSENT = "none"
 
 
 def check_same_options(run: Path, config: RunConfig, origin: Mapping[str, str | None]) -> None:
-    """Refuse to continue a run with other options than it was begun with.
+    """Refuse to resume a run with other options than its own.
 
     Args:
         run: the run folder, which has a config.yaml.

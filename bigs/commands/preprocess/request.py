@@ -1,4 +1,4 @@
-"""What a user asks of preprocessing, and what is told of each step."""
+"""The options of preprocessing, and the outcome of each step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS: tuple[StepName, ...] = ("frames", "masks", "object", "hands", "align", "b
 
 @dataclass(frozen=True)
 class PreprocessRequest:
-    """What the user gave. A source that is not given is looked for among the artefacts."""
+    """The user's options. A source that is not given is taken from the artefacts."""
 
     clip: Path
     source: Path | None = None  # video or folder of images
@@ -46,7 +46,7 @@ class PreprocessRequest:
 
 
 class StepOutcome(NamedTuple):
-    """What became of a step."""
+    """The outcome of a step."""
 
     name: StepName
     state: Literal["made", "up to date", "supplied"]

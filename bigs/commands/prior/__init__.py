@@ -1,1 +1,1 @@
-"""Priors for what no frame shows: words taught, small models trained, weights found."""
+"""Priors for what no frame shows: learned words, small trained models, and loading of weights."""

@@ -36,7 +36,7 @@ _GIB = 2.0**30
 
 
 class FittedToken(NamedTuple):
-    """What `fit_token` came to."""
+    """The result of `fit_token`."""
 
     path: Path
     steps: int  # taken now, without those of before
@@ -154,7 +154,7 @@ def _keep(inversion: Inversion, path: Path, origin: str) -> None:
 
 
 def read_state(path: Path, form: str, origin: str, of_what: str) -> tuple[dict[str, torch.Tensor], int]:
-    """What was kept of a training, and after how many steps.
+    """The saved state of a training, and its number of steps.
 
     Raises:
         InputError: damaged, or not of this `form` and `origin`; `of_what` says what those depend on.

@@ -49,7 +49,7 @@ _ASKED_MESHES, _ASKED_VIEWS, _ASKED_SHARE = 200, 8, 0.95
 
 
 class TrainedPrior(NamedTuple):
-    """What `train_prior` came to."""
+    """The result of `train_prior`."""
 
     path: Path
     steps: int  # taken now

@@ -1,4 +1,4 @@
-"""What a finished run shows of itself: contact sheet, video, and the report around them."""
+"""The pictures of a finished run: contact sheet, video, and the report around them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _HIDDEN = 0.1
 
 @dataclass(frozen=True)
 class Told:
-    """What is known of a run beside its pictures."""
+    """Facts about a run besides its pictures."""
 
     table: Sequence[Sequence[str]]  # scores; the first row is the heading
     per_frame: Mapping[str, np.ndarray]  # score -> [T]
@@ -137,7 +137,7 @@ def _novel_view(playback: Playback, frame: int) -> np.ndarray:
 
 
 def _errors(per_frame: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
-    """The scores that are worth a curve, under the names that people read."""
+    """The scores that are drawn as curves, under readable names."""
     named = {}
     for key, values in per_frame.items():
         metric = ALL_METRICS[key]

@@ -1,4 +1,4 @@
-"""`bigs render`: which cameras see which times of a run, and the pictures, depths and video they give."""
+"""`bigs render`: the cameras and frames of a run, and the pictures, depths and video."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DepthFormat = Literal["png", "npy"]
 
 @dataclass(frozen=True)
 class Shot:
-    """What `bigs render` is asked to show. One of `cameras`, `orbit` and `from_input` is given."""
+    """What `bigs render` shows: one of `cameras`, `orbit` and `from_input`."""
 
     cameras: Path | None = None
     orbit: bool = False

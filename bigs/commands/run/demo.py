@@ -1,4 +1,4 @@
-"""The main job on a clip that the program makes itself: nothing to download, and the truth is known."""
+"""Reconstruction of a generated clip with known truth: nothing to download."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main job: a clip goes in, a run folder with hands and object comes out."""
+"""Reconstruction: a clip goes in, a run folder with hands and object comes out."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from bigs.train.start.initial import initial_trajectory
 
 @dataclass(frozen=True)
 class Outcome:
-    """What there is to tell after a run."""
+    """What to print after a run."""
 
     run: Path
     table: list[tuple[str, ...]]  # the first scores; the first row is the heading

@@ -37,7 +37,7 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a run of a series came to."""
+    """The outcome of a run of a series."""
 
     scores: dict[str, dict[str, float]] = field(default_factory=dict)  # "initial" and "result"
     times: dict[str, Any] = field(default_factory=dict)  # seconds; see `run_or_reuse`
@@ -69,7 +69,7 @@ def check_folders(runs: list[PlannedRun]) -> None:
 
 
 def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> FinishedRun:
-    """Run unless the folder holds the finished run; one that was interrupted goes on where it was.
+    """Run unless the folder holds the finished run; an interrupted one continues.
 
     Returns:
         The outcome, or why there is none. `times` has "wall" and "cpu" (seconds in all), "resumed" (they are
