@@ -19,7 +19,7 @@ from bigs.train.plan.config import (
 )
 from bigs.train.plan.ranges import check_ranges
 
-# What the renderer is compiled for.
+# The settings that the renderer is compiled for.
 COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}
 
 
@@ -73,7 +73,7 @@ def _check_densify(
             )
     if not {"object.geometry", "object.triplane"} & set(stage.lrs):
         raise InputError(f"{where}: expected a rate for object.geometry or object.triplane, found neither")
-    # From the least to the largest; a comparison with NaN is false.
+    # In ascending order; a comparison with NaN is false.
     orders: tuple[dict[str, float], ...] = (
         {"0": 0.0, "first": config.first, "last": config.last, "1": 1.0},
         {"every": config.every, "1": 1.0},

@@ -54,7 +54,7 @@ class FitReport:
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
     facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
     completed: bool = False  # whether symmetry has completed the object
-    # Seconds of the interrupted runs that this one continues; they count in `seconds`, too.
+    # Seconds of the interrupted runs that this one continues; `seconds` includes them.
     before: float = 0.0
 
 
@@ -299,7 +299,7 @@ def run_digest(
     denoiser: Denoiser | None,
 ) -> str:
     """Identifies what a checkpoint belongs to: version, configuration, images, masks and start values."""
-    # Of a network counts what is in it, not where it lies.
+    # The content of a network counts, not its path.
     prior = replace(config.prior, weights="", controlnet="", token="", edge_weights="")
     config = replace(config, perceptual_weights=(), prior=prior)
     origin = None if denoiser is None else denoiser.fingerprint

@@ -25,7 +25,7 @@ from bigs.train.plan.config import (
 class Switch:
     """An ingredient that a run can do without."""
 
-    text: str  # what is missing then
+    text: str  # what is left out
     off: Callable[[RunConfig], RunConfig]
 
 
@@ -141,7 +141,7 @@ def _pyramid(config: RunConfig) -> RunConfig:
     return _keep(config, lambda stage: replace(stage, image_size=finest))
 
 
-# Parameters of single frames, as the paper's P^t has them, not what all frames or those of a grasp share.
+# Parameters of single frames, like the paper's P^t, not those of all frames or of a grasp.
 _FRAME_POSES = (
     *(f"hand.{name}" for name in ("orient", "pose", "ray", "depth")),
     *(f"object.{name}" for name in ("orient", "ray", "depth")),
@@ -223,7 +223,7 @@ _INGREDIENTS = {
 
 _TERM_NAMES = dict.fromkeys(name for terms in (*IMAGE_TERMS.values(), TERMS) for name in terms)
 
-# What `--without` accepts: ingredients of several parts, then every other loss term under its own name.
+# The names that `--without` accepts: ingredients of several parts, then every other loss term.
 SWITCHES: dict[str, Switch] = _INGREDIENTS | {
     name: Switch(f"the loss term {name}", _terms(name)) for name in _TERM_NAMES if name not in _INGREDIENTS
 }

@@ -26,11 +26,11 @@ from bigs.train.grasps.search import (
 from bigs.train.plan.config import GraspStage
 from bigs.types import Side
 
-# The joints that tell where a hand is: the wrist, the knuckles and the fingers' ends.
+# The joints that give a hand's position: the wrist, the knuckles and the fingertips.
 _JOINTS = (0, 1, 4, 7, 10, 13, 16, 17, 18, 19, 20)
-# However wrong a depth is, a hand that holds the object is within this of its surface, metres.
+# However wrong its depth is, a hand that holds the object is within this distance of its surface, metres.
 _ARM = 0.3
-# A picture says more than an estimate: in the second cut a frame pays by both, half for the estimate.
+# Pictures say more than estimates, so in the second cut half of a frame's price comes from the masks.
 _ESTIMATE_SHARE = 0.5
 
 # How badly a hand's outline in poses of all T frames disagrees with its masks: [T] squared error per pixel of
@@ -128,7 +128,7 @@ def _search(
     stretches = [Stretch(frames, h) for h, frames in enumerate(proposed)]
     costs = _estimate_costs(points, information, proposed)
     if mismatch is not None:
-        # What a hand in its own pose comes to in most frames, though not in those whose estimate is off.
+        # The usual disagreement of a hand in its own pose; frames with wrong estimates have more.
         usual = float(mismatch(side, poses).nanquantile(0.25))
         apart = prices.free * ~touches
         for _ in range(stage.rounds):
@@ -159,7 +159,7 @@ def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
     found += [range(a.start, b.stop) for a, b in pairwise(stretches)]
     edges = [0, *(edge for s in stretches for edge in (s.start, s.stop)), count]
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        # Windows that overlap by half: a grasp lies in one of them for the most part.
+        # Windows that overlap by half, so that most of a grasp lies in one of them.
         step = 2 * least
         found += [range(a, min(a + step, stop)) for a in range(start, stop - least + 1, least)]
     return found

@@ -13,15 +13,16 @@ from bigs.models.scene import Scene
 from bigs.train.plan.config import ScaleSearchStage
 from bigs.types import Side
 
-# Until grasps are known, so many frames on end are one piece of evidence: errors of neighbours are alike.
+# Until grasps are known, this many consecutive frames count as one piece of evidence, since neighbours err
+# alike.
 _PIECE = 8
 
 
 class FoundSize(NamedTuple):
     """What a search came to."""
 
-    factor: float  # on the scale before
-    # Standard error of the factor, by how it changes without one grasp or the other; NaN if one alone speaks.
+    factor: float  # relative to the previous scale
+    # Standard error of the factor, from leaving out one grasp after the other; NaN for a single grasp.
     spread: float
     factors: Tensor  # [C] tried
     costs: Tensor  # [C]

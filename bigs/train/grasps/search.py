@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The largest price of a frame within a grasp, in prices of one outside: a few faulty frames are bridged.
+# Largest price of a frame within a grasp, relative to one outside, so that a few wrong frames are bridged.
 _MOST = 2.5
-# A frame is a stray when it is off by this many standard deviations from the middle of its neighbours ...
+# A frame is an outlier if it is off by this many standard deviations from the median of its neighbours ...
 _STRAY = 3.0
-# ... within this many frames on either side, of which most agree with one another.
+# ... within this many frames on either side, most of which agree.
 _NEIGHBOURS = 3
-# Grasps longer than this are found in parts, which bounds the work for long clips.
+# Longer grasps are found in parts, which bounds the work for long clips.
 _LONGEST = 400
 
 
@@ -32,10 +32,10 @@ class Stretch(NamedTuple):
 class Prices(NamedTuple):
     """What a segmentation pays; frames of grasps pay by how badly they fit."""
 
-    free: float  # for a frame outside grasps
-    grasp: float  # for each grasp
-    least: int  # frames of a grasp, at least
-    gap: int  # frames between two grasps, at least: nobody lets go and takes hold again in less
+    free: float  # price of a frame outside grasps
+    grasp: float  # price of each grasp
+    least: int  # fewest frames of a grasp
+    gap: int  # fewest frames between two grasps: nobody lets go and grasps again in less
 
 
 def still_costs(points: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ def grasps_by_estimates(
             grasp never worth more than outside.
         prices: in squared standard deviations.
     """
-    # A stray frame says nothing of the place, and pays as if it were outside.
+    # An outlier says nothing about the place and pays as if it were outside.
     trust = np.where(stray_frames(points, information), 1e-3, 1.0)
     costs = still_costs(points, trust[:, None, None] * information)
     fixed = np.concatenate([[0.0], np.cumsum(prices.free * np.maximum(trust < 1.0, ~touching))])
@@ -124,7 +124,7 @@ def grasps_by_frames(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     limited = np.minimum(costs, _MOST * prices.free)
     sums = np.concatenate([np.zeros((len(costs), 1)), np.cumsum(limited, axis=1)], axis=1)
     stretches = sums[:, None, :] - sums[:, :-1, None]
-    # Frames at a grasp's ends have to be worth more in it than outside.
+    # The frames at a grasp's ends must be cheaper inside than outside.
     return _cheapest(stretches, prices)
 
 
@@ -135,7 +135,7 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     cost = np.take_along_axis(costs, which[None], axis=0)[0]
     starts, ends = np.arange(count)[:, None], np.arange(count + 1)[None]
     cost = np.where(ends - starts >= prices.least, cost, np.inf)
-    # The cheapest cut of the first t frames that may begin a grasp next, and the one that ends in a grasp.
+    # The cheapest cut of the first t frames that may begin a grasp next, and the cheapest that ends in one.
     open_, ended = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     open_[0] = 0.0
     began = np.zeros(count + 1, dtype=int)

@@ -108,7 +108,7 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     ):
         scene.object_splats = ObjectDetail(count)
     if isinstance(scene.object_splats, ObjectSplats):
-        # Of any number, since they may have been cloned, split and pruned.
+        # Their number may differ, since they may have been cloned, split and pruned.
         scene.object_splats.place(Anchors(*(tensors[f"scene.object_splats.{n}"] for n in Anchors._fields)))
     if "scene.surface_verts" in tensors:
         scene.replace_surface(ObjectSurface(tensors["scene.surface_verts"], tensors["scene.surface_faces"]))

@@ -17,10 +17,10 @@ from torch import Tensor
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.models.object_splats import Anchors, CanonicalObject
 
-# By what the two parts of a Gaussian are shorter than it: 3DGS's number.
+# The two parts of a Gaussian are shorter by this factor, as in 3DGS.
 _SHORTER = 1.6
-# How far each lies from its middle, in standard deviations: both together then have its covariance. 3DGS
-# draws the places; but where a field moves neighbours alike, that leaves holes which nothing closes.
+# Distance of each part from the middle, in standard deviations: together they then have its covariance. 3DGS
+# draws the places at random, but where a field moves neighbours alike that leaves holes.
 _APART = math.sqrt(1.0 - _SHORTER**-2)
 
 
@@ -31,19 +31,18 @@ class DensifyConfig:
     Numbers are the released code's; where a condition of its can never be met, 3DGS's.
     """
 
-    # The first time, the last and the time between as shares of the stage's steps: 3600, 14400 and 600 of
-    # 30 000. A stage of fewer steps does the same as often.
+    # First time, last time and interval as shares of the stage's steps: 3600, 14400 and 600 of 30 000.
     first: float = 0.12
     last: float = 0.48
     every: float = 0.02
-    # Mean over the views that show a Gaussian of the gradient at its centre on screen, in 3DGS's unit: error
-    # averaged over all pixels of the clip's image, per half that image. It depends neither on the size at
-    # which the stage looks nor on how large the object is there.
+    # Threshold of the gradient at a Gaussian's centre on screen, averaged over the views that show it, in
+    # 3DGS's unit: error averaged over all pixels of the clip's image, per half that image. It depends neither
+    # on the stage's image size nor on the object's.
     threshold: float = 2e-4
-    # A Gaussian under pull is cloned if its longest axis is up to this share of the object's radius, and
-    # split if it is longer. The released 0.001 is of metres: 1 mm, which for an object in hands is this.
+    # A Gaussian above the threshold is cloned if its longest axis is up to this share of the object's radius,
+    # and split if it is longer. The released 0.001 is 1 mm, which for a hand-held object is this.
     small: float = 0.01
-    # Longer ones than this share are pruned, and so are those less opaque than `least_opacity`.
+    # Gaussians longer than this share, or less opaque than `least_opacity`, are pruned.
     large: float = 0.1
     least_opacity: float = 0.005
     # Nothing is pruned below `floor` Gaussians, and none is added above `ceiling`.
@@ -71,8 +70,8 @@ class DensifyConfig:
 class Pull(NamedTuple):
     """What has been gathered of N Gaussians since the last time."""
 
-    total: Tensor  # [N] sum over the views that showed it of how hard the loss pulled at its centre
-    views: Tensor  # [N] how many these were
+    total: Tensor  # [N] sum of gradient norms at its centre over the views that showed it
+    views: Tensor  # [N] number of these views
     drift: Tensor  # [N, 3] summed gradient at its centre in the object's frame
 
     @classmethod

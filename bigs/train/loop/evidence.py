@@ -21,9 +21,9 @@ from bigs.train.plan.config import GraspStage, RunConfig, ScaleSearchStage, Stag
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side
 
-# Standard deviation of the Gaussians that stand for a hand in the silhouette term, metres.
+# Standard deviation of the Gaussians that represent a hand in the silhouette term, metres.
 SILHOUETTE_SIGMA = 0.0022
-# Centres go in by this many standard deviations of a Gaussian as it appears in the image. Opaque neighbours
+# Centres are moved inwards by this many standard deviations of a Gaussian in the image. Opaque neighbours
 # overlap, so their common alpha falls to one half well outside the centres.
 INSET = 2.0
 
@@ -100,7 +100,7 @@ class EvidenceSource:
             alphas = step.render(posed).alphas.squeeze(-1)
             own, hidden = evidence.targets.shares[side], evidence.targets.hidden[side]
             squares = (alphas - alphas.clamp(own, own + hidden)).square().sum((1, 2))
-            # A hand that hardly shows is no measure of what is wrong with it.
+            # A hand that hardly shows gives no reliable measure.
             area = own.sum((1, 2))
             shown = evidence.targets.foreground.sum((1, 2)) > 0
             return torch.where(shown, squares / area.clamp_min(0.25 * area.median()), torch.nan)
@@ -111,7 +111,7 @@ class EvidenceSource:
         if size not in self._targets:
             long_side = max(self.clip.width, self.clip.height)
             scale = min(1.0, size / long_side) if size else 1.0
-            # One resolution at a time: a stage that returns to an earlier one is rare, memory is not.
+            # Keep one resolution at a time: few stages return to an earlier one, and memory is scarce.
             self._targets = {size: load_targets(self.clip, self.unknown, scale, self.box)}
         return self._targets[size]
 

@@ -12,12 +12,12 @@ from bigs.checks import InputError, expected_among
 from bigs.models.scene import Scene
 
 _LIGHT = {"light": "clip", "shade": "shade"}
-# Group name -> where its parameters are, below a hand's or the object's modules.
+# Group name -> its parameters, below a hand's or the object's modules.
 _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
 _HAND_POSE = ("betas", "orient", "pose", "pose_bias", "ray", "depth")
-# Of a whole grasp, relative to the object.
+# Poses of a whole grasp, relative to the object.
 _GRASP = {"grasp_orient": "orient", "grasp_pose": "pose", "grasp_position": "position"}
-# Of Gaussians without a field.
+# Gaussians without a field.
 _DETAIL = ("shift", "size", "opacity", "color")
 _OBJECT_FIELD = ("triplane", "appearance", "geometry")
 GROUPS = (
@@ -26,8 +26,8 @@ GROUPS = (
     "scene.light",
     "scene.shade",
 )
-# One row for each frame. A step that does not look at a frame says nothing about its turns and fingers; rays
-# and depths gain from what momentum and the priors over time do between a frame's own steps.
+# Parameters with one row per frame. A step that does not look at a frame says nothing about its rotations and
+# fingers; rays and depths gain from momentum and from priors over time.
 _ROW_PER_FRAME = ("hand.orient", "hand.pose", "object.orient")
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1])),

@@ -22,7 +22,7 @@ from bigs.raster import rust
 from bigs.train.loop import step, terms
 from bigs.train.loop.optim import FrameAdam
 
-# What a step's time is split into; what is in none of them is the stage's `rest`.
+# The parts of a step's time; what belongs to none is the stage's `rest`.
 PHASES = (
     "fields",  # canonical Gaussians from triplanes and decoders
     "posing",  # Gaussians, vertices and joints carried to the frames
@@ -41,7 +41,7 @@ class StageTimes:
     """One stage of a run: seconds."""
 
     wall: float = 0.0
-    cpu: float = 0.0  # of all threads
+    cpu: float = 0.0  # CPU time of all threads
     steps: int = 0
     in_steps: float = 0.0  # wall seconds of the steps alone
     phases: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
@@ -57,9 +57,9 @@ class Profile:
 
     def __init__(self) -> None:
         self.stages: dict[str, StageTimes] = {}
-        self._open: list[str] = []  # phases that have begun, the innermost last
+        self._open: list[str] = []  # running phases, the innermost last
         self._current = StageTimes()
-        self._since = 0.0  # the clock when time was last given to a phase
+        self._since = 0.0  # when time was last assigned to a phase
         self._began = (0.0, 0.0)
 
     def listen(self, event: dict[str, Any]) -> None:

@@ -40,9 +40,9 @@ class StageState(NamedTuple):
     best: float  # smoothed loss that the stopping rule compares with
     best_step: int
     smoothed: float
-    retreats: int  # how often the stage went back after something that was not finite
-    found: Mapping[str, Tensor]  # what the stage began from, by name, where it has to know that
-    pull: Pull | None  # at the object's Gaussians since they were last cloned, split and pruned
+    retreats: int  # number of retreats after non-finite values
+    found: Mapping[str, Tensor]  # the stage's start by name, if it needs it
+    pull: Pull | None  # gradients at the object's Gaussians since the last densification
 
     @classmethod
     def begun(
@@ -54,7 +54,7 @@ class StageState(NamedTuple):
 
 # The parts of `StageState` that are plain numbers.
 NUMBERS = ("step", "best", "best_step", "smoothed", "retreats")
-# A stage gives up after so many retreats; each halves its rates.
+# A stage gives up after this many retreats; each halves its rates.
 MOST_RETREATS = 4
 
 
@@ -227,7 +227,8 @@ def _evaluate(step: Step, terms: Mapping[str, Term]) -> tuple[dict[str, Tensor],
         try:
             values[name] = term.loss(step)
         except InputError as error:
-            # The renderer refuses what is not finite; the user's poses were, so the optimisation did it.
+            # The renderer refuses non-finite input; the user's poses were finite, so the optimisation is at
+            # fault.
             return values, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
     bad = [name for name, value in values.items() if not torch.isfinite(value)]
     return values, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
@@ -244,7 +245,7 @@ def _first_unbounded(scene: Scene) -> str:
 
 def _unbounded_gradient(scene: Scene) -> str | None:
     for name, values in scene.named_parameters():
-        # A sum is finite only if all of it is, save for overflow, which is no better.
+        # A sum is finite only if every value is, except for overflow, which is as bad.
         if values.grad is not None and not torch.isfinite(values.grad.sum()):
             wrong = torch.nonzero(~torch.isfinite(values.grad))
             place = f" at {wrong[0].tolist()}" if len(wrong) else ""

@@ -26,14 +26,14 @@ class Evidence:
     """What a stage's terms look at besides the scene; fixed for the stage."""
 
     targets: Targets
-    touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as is known
-    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands, of this resolution
+    touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as known
+    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands for this resolution
     contact: str  # "center" or "surface"
     settings: RasterSettings
-    perceptual: VggWeights | None = None  # what the term "perceptual" needs
+    perceptual: VggWeights | None = None  # the network of the term "perceptual"
 
 
-# A pixel counts as covered by something unlabelled when more than this share of it is.
+# A pixel counts as covered by an unlabelled occluder above this share.
 _COVERED = 0.5
 
 
@@ -44,7 +44,7 @@ class Pixels(NamedTuple):
     alphas: Tensor  # [M, 1] rendered
     images: Tensor  # [M, 3]
     foreground: Tensor  # [M]
-    empty: Tensor  # [M] share that shows no subject, nor anything unlabelled that may hide one
+    empty: Tensor  # [M] share that shows neither a subject nor an unlabelled occluder
     shares: Tensor  # [M, E] for the entities rendered
 
 
@@ -55,9 +55,9 @@ class Selection:
     frames: Tensor  # [B]
     entities: tuple[Entity, ...] = ()  # rendered alone or together; none if no term looks at Gaussians
     labels: bool = True  # whether the joint rendering has label channels
-    seed: int = 0  # of what the terms draw
-    free_frames: bool = False  # whether a hand alone is looked at where it holds nothing, instead of `frames`
-    pull: bool = False  # whether `Step.object_pull` will be asked for
+    seed: int = 0  # random seed of the terms
+    free_frames: bool = False  # whether a hand alone is rendered where it holds nothing, not at `frames`
+    pull: bool = False  # whether `Step.object_pull` will be needed
 
 
 @dataclass
@@ -166,10 +166,10 @@ class Step:
         if "object" not in self._alone:
             return None
         info = self._alone["object"].info
-        # The clip's whole image in pixels of this stage's.
+        # The clip's whole image in pixels of this stage's size.
         zoom = self.evidence.targets.K.diagonal()[:2] / self.scene.K.diagonal()[:2]
         size = zoom * zoom.new_tensor([self.scene.width, self.scene.height])
-        # Terms of images average over the object's pixels in all views, and over the subjects.
+        # Image terms average over the object's pixels in all views, and over the subjects.
         average = len(self.entities) * self.share_alone("object").sum() / size.prod()
         on_screen = average * 0.5 * size * info["means2d"].grad.squeeze(1)
         return on_screen, info["depths"].squeeze(1) > 0, self.canonical["object"].means.grad

@@ -20,7 +20,7 @@ class Targets:
 
     images: Tensor  # [T, H, W, 3] in [0, 1]
     shares: dict[Entity, Tensor]  # [T, H, W] share of each pixel that shows the entity
-    unknown: Tensor  # [T, H, W] share of each pixel in which something unlabelled may hide a subject
+    unknown: Tensor  # [T, H, W] share of each pixel in which an unlabelled occluder may hide a subject
     K: Tensor  # [3, 3] intrinsics of the crop
     width: int
     height: int
@@ -71,7 +71,7 @@ def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, 
     labels = np.stack([clip.mask(t)[y0:y1, x0:x1] for t in range(len(clip))])
     images = np.stack([clip.image(t)[y0:y1, x0:x1] for t in range(len(clip))])
     full = torch.from_numpy(images).permute(0, 3, 1, 2)
-    # Frame by frame: a whole clip in float at full size would be the largest array of the run.
+    # Frame by frame: a whole clip in floats at full size would be the run's largest array.
     small = torch.cat(
         [
             torch.nn.functional.interpolate(

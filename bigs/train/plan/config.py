@@ -32,16 +32,16 @@ class OptimizeStage:
     image_size: int = 0
     # How many frames share one evaluation of the canonical fields; 0 takes the whole clip.
     frames_per_step: int = 0
-    # Only the frames in which a hand holds nothing, each hand's own; those of its grasps stay as they are.
+    # Only frames in which a hand holds nothing, for each hand; frames of its grasps stay as they are.
     free_frames: bool = False
-    # A frame that a step does not look at keeps its turns and fingers, and their moments in the optimiser.
+    # A frame that a step does not look at keeps its rotations and fingers, and their Adam moments.
     frame_moments: bool = False
     # Learning rates fall along a cosine to this share.
     final_lr: float = 0.1
-    # Stop when the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
+    # Stop if the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
     stop_patience: int = 0
     stop_gain: float = 0.002
-    # The object's Gaussians are cloned, split and pruned meanwhile; None keeps them as many as they are.
+    # Clone, split and prune the object's Gaussians during the stage; None keeps their number.
     densify: DensifyConfig | None = None
 
 
@@ -51,11 +51,11 @@ class ScaleSearchStage:
 
     name: str = "object-scale-search"
     step: Step = "interacting-subjects"
-    # Relative sizes tried: `candidates` values evenly in 1 - span ... 1 + span.
+    # Relative sizes to try: `candidates` values evenly spaced in 1 - span ... 1 + span.
     span: float = 0.14
     candidates: int = 29
-    # Contact cannot tell the object in front of a palm from the object behind it, occlusion can: the label
-    # term at this weight, this size and over this many frames.
+    # Contact cannot tell an object in front of a palm from one behind it, but occlusion can: weight, image
+    # size and number of frames of the label term.
     labels_weight: float = 2.0
     image_size: int = 100
     frames: int = 12
@@ -67,27 +67,27 @@ class GraspStage:
 
     name: str = "grasps"
     step: Step = "interacting-subjects"
-    # A frame outside grasps costs as much as one in a grasp whose squared error is this, in standard
-    # deviations; a grasp costs as much as a few frames outside, so that five frames can be one.
+    # A frame outside grasps costs as much as a frame in a grasp with this squared error, in standard
+    # deviations; a grasp costs as much as a few frames outside, so that five frames can form one.
     free: float = 3.0
     grasp: float = 8.0
-    # Fewer frames than this are no grasp.
+    # Fewest frames of a grasp.
     least: int = 4
-    # Nobody lets go and takes hold elsewhere in fewer frames than this: a sixth of a second.
+    # Fewest frames between two grasps: nobody lets go and grasps again within a sixth of a second.
     gap: int = 5
-    # Where estimates have a hand, across the view and along it, as standard deviations per metre of distance:
-    # an outline tells the place to a few millimetres, and its size tells the distance to a few per cent.
+    # Errors of estimates across and along the view, as standard deviations per metre of distance: an outline
+    # tells the position to a few millimetres, and its size the distance to a few per cent.
     error_aside: float = 0.007
     error_along: float = 0.03
     # Disagreement with the masks, in squared error per pixel of the hand beyond that of the frame's own
     # estimate, that costs as much as a frame outside: about a third of the hand beside its mask.
     excess: float = 0.4
-    # Long side in pixels at which masks are compared, and how often grasps are carried and cut anew.
+    # Long side in pixels at which masks are compared, and how often grasps are carried and cut again.
     image_size: int = 160
     rounds: int = 2
-    # A hand that changes its grasp within so many frames turns evenly from one to the next.
+    # A hand that changes its grasp within this many frames turns evenly from one to the next.
     longest_move: int = 16
-    # What a frame of a grasp may add of its own, as a factor on its residuals; 0 makes grasps rigid.
+    # Factor on the residuals that a frame of a grasp adds to it; 0 makes grasps rigid.
     slack: float = 0.1
 
 
@@ -109,15 +109,15 @@ class SplitStage:
 
     name: str = "split"
     step: Step = "single-subject"
-    # Each Gaussian of the object becomes parts x parts smaller ones.
+    # Each Gaussian of the object is split into parts x parts smaller ones.
     parts: int = 2
-    # Whether the hands, too, leave their field.
+    # Whether the hands leave their field too.
     hands: bool = True
     # Gaussians of the object less opaque than this are pruned.
     least_opacity: float = 0.05
 
 
-# What is believed of the object's parts that no frame shows.
+# How to complete the object where no frame shows it.
 PriorKind = Literal["off", "symmetry", "trained", "sd"]
 
 
@@ -146,7 +146,7 @@ class CompletionStage:
 
     name: str = "object-completion"
     step: Step = "single-subject"
-    # The clip's own frames may come to show so much worse; beyond that all is undone.
+    # Undo everything if the error of the clip's own frames grows by more than this share.
     most_worsening: float = 0.005
 
 
@@ -160,7 +160,7 @@ class GuidanceStage:
     name: str = "object-prior"
     step: Step = "single-subject"
     steps: int = 300
-    # Virtual views in a step, and their size in pixels.
+    # Virtual views per step, and their size in pixels.
     views: int = 4
     image_size: int = 64
     # Learning rates: metres along the normal, and logarithms or logits.
@@ -168,20 +168,20 @@ class GuidanceStage:
     lr_size: float = 0.01
     lr_opacity: float = 0.02
     lr_color: float = 0.05
-    # Weight of the evenness of neighbours' shifts.
+    # Weight of the smoothness of neighbours' shifts.
     smooth: float = 0.01
     # Range of timesteps at the start and at the end, as shares of the prior's schedule.
     t_first: tuple[float, float] = (0.5, 0.98)
     t_last: tuple[float, float] = (0.02, 0.3)
-    # The stage is skipped when this share of the object was seen, and so are views of which this share was.
+    # Skip the stage if this share of the object was seen, and views of which this share was seen.
     enough: float = 0.9
     well_seen: float = 0.85
-    # What was seen may come to show so much worse, and the object may grow so much beyond its mask in any
-    # frame; beyond that all is undone.
+    # Undo everything if the error of the seen part, or the object's area outside its mask in any frame, grows
+    # by more than this share.
     damage: float = 0.02
-    # Weight by which the clip's frames hold what they show of the object as it was found, per pixel.
+    # Weight per pixel of the clip's frames, which hold what they showed of the object at the stage's start.
     hold: float = 0.3
-    # A prior that says so much more wrongly what was seen than what it learned from does not know the object.
+    # Leave out a prior whose error on the seen part is this many times its error on its own meshes.
     unlike: float = 1.2
 
 
@@ -205,13 +205,13 @@ class RunConfig:
     hand: HandSplatsConfig = field(default_factory=HandSplatsConfig)
     object: ObjectSplatsConfig = field(default_factory=ObjectSplatsConfig)
     raster: RasterSettings = field(default_factory=RasterSettings)
-    # Colours follow the direction a surface faces (see `models.lighting`); the paper's are fixed.
+    # Colours depend on the direction that a surface faces (see `models.lighting`); the paper's are fixed.
     lighting: bool = True
-    # Eq. 8's pull of centres, or the pull of nearest surfaces where the image shows touch.
+    # Eq. 8's distance of centres, or the distance of surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
     prior: PriorConfig = field(default_factory=PriorConfig)
     # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
     perceptual_weights: tuple[str, ...] = ()
     stages: tuple[Stage, ...] = ()
-    # Steps between checkpoints within a stage; a stage's end is always saved.
+    # Steps between checkpoints within a stage; the end of a stage is always saved.
     checkpoint_every: int = 100

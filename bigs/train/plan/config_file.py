@@ -17,7 +17,7 @@ from bigs.files import parse_yaml, read_yaml
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.ranges import check_ranges
 
-# So much of a change shows in a message.
+# Messages show this much of a change.
 _SHOWN = 80
 
 

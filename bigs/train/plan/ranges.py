@@ -46,28 +46,28 @@ class Range(NamedTuple):
         return f"more than {low} and less than {high}" if self.open else f"{low} to {high}"
 
 
-# Larger whole bounds are shown in all their digits.
+# Whole bounds are shown in full.
 _EXACT = 1e12
-# No number of a plan is negative. Weights, rates, lengths, steps: a million times those of presets, and still
-# far within float32.
+# No number of a plan is negative. The limit of weights, rates, lengths and steps is a million times that of
+# presets, and still far within float32.
 _ANY = Range(0.0, 1e9)
 _SHARE = Range(0.0, 1.0)
-# Of which a logit is taken.
+# A logit is taken of these.
 _INSIDE = Range(0.0, 1.0, open=True)
 _POSITIVE = Range(0.0, 1e9, open=True)
-# Network widths, texels, cells on a side: what decides about memory. Presets have 24 to 256.
+# Network widths, texels, grid cells, which decide about memory. Presets have 24 to 256.
 _CELLS = Range(1, 4096)
 _PIXELS = Range(0, 1 << 16)
 _COUNT = Range(1, 10**6)
 
-# By the class that has the number, and its name.
+# By the number's class and name.
 RANGES: dict[type, dict[str, Range]] = {
-    # What both random generators take.
+    # Range of seeds of both random generators.
     RunConfig: {"seed": Range(0, 2**63 - 1), "checkpoint_every": Range(1, 10**9)},
     TriplaneConfig: {"features": _CELLS, "resolution": Range(2, 4096), "init_std": Range(0.0, 100.0)},
     DecoderConfig: {"appearance_width": _CELLS, "geometry_width": _CELLS, "skinning_width": _CELLS},
     HandSplatsConfig: {
-        "subdivisions": Range(0, 4),  # each makes four of one
+        "subdivisions": Range(0, 4),  # each level multiplies by four
         "scale_per_spacing": _POSITIVE,
         "flatness": _POSITIVE,
         "opacity": _INSIDE,
@@ -137,7 +137,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "image_size": Range(16, 1 << 12),
         "t_first": _SHARE,
         "t_last": _SHARE,
-        # More than all is never seen: then nothing is skipped.
+        # More than everything is never seen, so nothing is skipped.
         "enough": Range(0.0, 10.0),
         "well_seen": Range(0.0, 10.0),
     },
@@ -164,7 +164,7 @@ def _check_value(where: str, value: Any, within: Range) -> None:
             _check_value(f"{where}.{key}", item, within)
     elif isinstance(value, tuple):
         for i, item in enumerate(value):
-            # Stages have names, and paths go by them.
+            # Paths name stages, not their places.
             _check_value(f"{where}.{item.name}" if hasattr(item, "name") else f"{where}[{i}]", item, within)
     elif isinstance(value, int | float) and not isinstance(value, bool) and value not in within:
         raise InputError(f"{where}: expected {within}, found {shown(value)}")

@@ -12,13 +12,14 @@ import torch
 
 from bigs.data.base import Clip
 
-# Colours (in [0, 1]) that differ by more than this are not the same surface; noise and soft shadows are less.
+# Colours (in [0, 1]) that differ by more than this belong to different surfaces; noise and soft shadows
+# differ less.
 _THRESHOLD = 0.06
 # Long side in pixels at which frames are compared: occluders are large, and a clip then fits in memory.
 _SIZE = 320
-# Half the width in compared pixels of holes that are closed.
+# Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
-# With more of the background moving than this, the camera moves or the light changes: nothing can be told.
+# If more of the background moves than this, the camera moves or the light changes, and nothing is known.
 _USELESS_SHARE = 0.5
 
 
@@ -44,8 +45,8 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     cross = scipy.ndimage.generate_binary_structure(2, 1)[None]
     unknown = scipy.ndimage.binary_opening(unknown, cross, iterations=1)
     unknown = scipy.ndimage.binary_dilation(unknown, cross, iterations=2) & background
-    # An occluder that happens to have the background's colour here and there has holes, and one pixel's hole
-    # carves a tunnel through the visual hull: what unknown and known pixels enclose is closed.
+    # An occluder with the background's colour here and there has holes, and one pixel's hole carves a tunnel
+    # through the visual hull, so holes between unknown and known pixels are closed.
     padded = np.pad(unknown | ~background, ((0, 0), (_CLOSE, _CLOSE), (_CLOSE, _CLOSE)), mode="edge")
     closed = scipy.ndimage.binary_closing(padded, cross, iterations=_CLOSE)[:, _CLOSE:-_CLOSE, _CLOSE:-_CLOSE]
     near = scipy.ndimage.binary_dilation(unknown, cross, iterations=2 * _CLOSE)

@@ -127,7 +127,7 @@ def build_scene(
     return SceneStart(scene, skipped, symmetries, known)
 
 
-# A mesh that would lose less of its area is left closed.
+# A mesh that would lose less of its area stays closed.
 _LITTLE = 0.005
 
 

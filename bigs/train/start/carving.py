@@ -22,7 +22,7 @@ from bigs.geometry.surface import (
 from bigs.train.start.initial import InitialConfig, ObjectStart
 from bigs.types import MASK_VALUES
 
-# Fewer points than this carry no surface.
+# Fewer points give no surface.
 _MIN_POINTS = 30
 
 
@@ -60,7 +60,7 @@ def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
 class Carving:
     """What the clip's frames leave of the space around the object, and its points there."""
 
-    hull: DistanceGrid  # to the visual hull; right up to `InitialConfig.surface_reach`
+    hull: DistanceGrid  # to the visual hull; exact up to `InitialConfig.surface_reach`
     shown: np.ndarray  # [X * Y * Z] share of the frames that show object there; 0 outside the hull's reach
     points: np.ndarray  # [N, 3] metres, inside the silhouettes
     normals: np.ndarray  # [N, 3] unit, outward
@@ -99,7 +99,7 @@ def carve(clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialCo
     grid = empty_grid(lower, upper, config.surface_resolution)
     labels = np.stack([clip.mask(t) for t in usable])
     rotations, centers = start.rotations[usable].numpy(), start.centers[usable].numpy()
-    # Whatever is not background may hide the object, so the object may be there.
+    # Anything but background may hide the object, so the object may be there.
     allowed = (labels != 0) | unknown[usable]
     silhouettes = [
         silhouette_around_points(mask, start.points @ rotation.T + center, clip.K)

@@ -23,11 +23,11 @@ class CompletionConfig:
     """When parts that were never seen are completed by symmetry. Lengths in metres."""
 
     symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
-    # Nothing is completed when this share of the surface was seen.
+    # Nothing is completed if this share of the surface was seen.
     enough: float = 0.9
-    # Seen surface speaks for a symmetry only this near to a point: elsewhere it may be the hull's alone.
+    # Seen surface supports a symmetry only this near to a point: elsewhere it may belong to the hull alone.
     measured: float = 0.008
-    # A carried point is new when it is further than this from all others.
+    # A carried point is new if it is further than this from all others.
     gap: float = 0.003
 
 
@@ -55,7 +55,7 @@ class Completion:
         return f"{found} found, {len(self.points)} points added where nothing was seen"
 
 
-# Of that tolerance the hull, which three frames agree on, takes this share.
+# The hull, which three frames agree on, gets this share of that tolerance.
 _OUTSIDE = 0.67
 
 
@@ -90,7 +90,7 @@ def complete(
         return replace(nothing, why_not="no strong evidence for any")
     known = SeenSurface(carving.points, carving.normals, colors[tree.query(carving.points)[1]])
     whole = completed(known, symmetries, is_empty, config.gap)
-    # The points now stand all around the object, so nothing is beyond their convex hull.
+    # The points now surround the object, so nothing lies beyond their convex hull.
     grid = carving.closed(initial, whole.points, whole.normals, 0.0)
     added = slice(len(known.points), None)
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])

@@ -23,33 +23,32 @@ from bigs.types import HandObjectTrajectory, Side
 class InitialConfig:
     """How the clip's estimates become start values."""
 
-    # Width in frames of the robust smoothing of hand and object poses; wider than about 2 smears re-grasps.
+    # Width in frames of the robust smoothing of hand and object poses; more than about 2 blurs re-grasps.
     smooth_hands: float = 2.0
     smooth_object: float = 2.0
-    # Trust in a frame that the estimator filled in by interpolation.
+    # Weight of a frame that the estimator interpolated.
     interpolated_trust: float = 0.1
-    # Cells along the longest side of the grid on which the object's surface is found.
+    # Cells along the longest side of the grid on which the object's surface is computed.
     surface_resolution: int = 80
-    # Share of a point's plane against the visual hull falls to nothing at this distance, metres.
+    # Distance at which a point's plane loses all influence against the visual hull, metres.
     surface_reach: float = 0.016
-    # Frames that must agree before a place is carved away: masks and poses have single faults.
+    # Frames that must agree before a place is carved away, since single masks and poses are wrong.
     surface_agreeing: int = 3
-    # The surface may leave the points' convex hull by this much, metres, and further only where the masks
-    # show object in more than this share of the frames.
+    # The surface may exceed the points' convex hull by this much, metres, and more only where the masks show
+    # object in more than this share of the frames.
     surface_margin: float = 0.002
     surface_shown: float = 0.8
-    # A part of the surface counts as seen when it shows in so many frames: fewer may be a fault of mask or
-    # pose.
+    # Surface counts as seen if it shows in this many frames: fewer may be an error of a mask or pose.
     seen_frames: int = 3
-    # Poses are wrong by about so much, metres: nearer surface does not hide, and nothing is known to be empty
-    # nearer.
+    # Typical error of poses, metres: nearer surface does not occlude, and space nearer than this is not known
+    # to be empty.
     seen_tolerance: float = 0.006
-    # Surface further than this from any seen or measured one is a guess, metres. Where more than this share
-    # of the surface is one, and no symmetry speaks for it, hands do not meet it: closing what was never seen
-    # fills a grip that a hand is in.
+    # Surface further than this from any seen or measured one is a guess, metres. If more than this share of
+    # the surface is a guess and no symmetry supports it, contact ignores it, since closing what was never
+    # seen fills a grip that a hand is in.
     surface_solid: float = 0.015
     surface_guessed: float = 0.1
-    # The mesh ends so far from any seen or measured surface, metres.
+    # The mesh ends this far from any seen or measured surface, metres.
     surface_kept: float = 0.03
 
 

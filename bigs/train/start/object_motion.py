@@ -61,7 +61,7 @@ def find_object_motion(
 def with_motion(start: ObjectStart, motion: TrackedMotion) -> ObjectStart:
     """The object's start in the motion found; a frame is trusted as far as it is known."""
     error = turn_errors(motion)
-    # An interpolated pose becomes a measured one where tracks tell it as well as a measurement would.
+    # An interpolated pose counts as measured where tracks know it as well as a measurement would.
     trust = np.maximum(start.trust.numpy(), np.where(error < motion.turn_sigma, 1.0, 0.0))
     doubted = motion.contradicted & (error > motion.turn_sigma)
     return start._replace(
@@ -108,7 +108,7 @@ def _digest(clip: Clip, given: GivenPoses, stage: ObjectMotionStage) -> str:
 def _read(file: Path, digest: str) -> TrackedMotion | None:
     """What is in the file, if it is whole and of this clip and plan."""
     try:
-        # By its bytes: numpy leaves a file open that is no archive.
+        # Read as bytes, since numpy leaves a file open that is no archive.
         with np.load(io.BytesIO(file.read_bytes())) as stored:
             if str(stored["digest"]) != digest:
                 return None

@@ -32,12 +32,12 @@ from bigs.train.unseen.seen import (
     weights_in_pictures,
 )
 
-# A Gaussian that shows is left, and none is added that would. Where one is taken away the next may show, so
-# they are looked at again.
+# Gaussians that show are kept, and none that would show is added. Removing one may reveal the next, so they
+# are checked again.
 _PASSES = 3
-# Colours of what was never seen are means over so many of their images: a pattern need not go on as it began.
+# Colours of what was never seen average over this many mirrored Gaussians, since a pattern need not continue.
 _COLORS_FROM = 8
-# The colour of a place is a mean over so many Gaussians: after many steps neighbours differ by more than the
+# The colour of a place averages over this many Gaussians: after many steps neighbours differ by more than the
 # surface does, since only their sum shows.
 _BLENDED = 24
 
@@ -126,7 +126,7 @@ def blended_colors(canonical: CanonicalObject, chosen: np.ndarray, points: np.nd
     index = np.flatnonzero(chosen)
     nearest = range(1, min(_BLENDED, len(index)) + 1)
     near = index[scipy.spatial.cKDTree(canonical.means.numpy()[index]).query(points, k=nearest)[1]]
-    # What a Gaussian covers where it lies flat.
+    # The area that a Gaussian covers if it lies flat.
     area = canonical.opacities * canonical.scales.sort(dim=-1).values[:, 1:].prod(-1)
     weights = area.numpy()[near, None]
     return (weights * canonical.colors.numpy()[near]).sum(1) / weights.sum(1)

@@ -29,14 +29,15 @@ from bigs.raster.settings import RasterSettings
 from bigs.train.loop.run_stage import StageState
 from bigs.train.plan.config import GuidanceStage
 
-# Directions from which the object is looked at, before they are moved a little.
+# Directions from which the object is viewed, before jitter.
 _DIRECTIONS = 256
 _NEIGHBOURS = 8
 
 
-# Told the state after every step, and the loss.
+# Called with the state and the loss after every step.
 AfterStep = Callable[[StageState, float], None]
-# The loss by which the clip's frames hold the object as it was found; what it draws, it draws from there.
+# The loss by which the clip's frames hold the object as it was at the start; it draws from the given
+# generator.
 Hold = Callable[[CanonicalObject, torch.Generator], Tensor]
 
 
@@ -65,7 +66,7 @@ class Guided:
     """What the prior did."""
 
     moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
-    worst: float  # by what share the worst of the faults grew
+    worst: float  # relative growth of the largest error
     rolled_back: bool
 
 
@@ -164,7 +165,7 @@ def guide_object(
             progress=step / stage.steps,
             generator=generator,
         )
-        # Neighbours move together, so that the surface stays one.
+        # Neighbours move together, so that the surface stays connected.
         rough = (detail.shift - detail.shift[neighbours].mean(1)) / spacing
         loss = prior + stage.smooth * rough[unseen].square().sum()
         if hold is not None:

@@ -37,11 +37,11 @@ from bigs.train.unseen.seen import (
     weights_in_pictures,
 )
 
-# A Gaussian counts as seen when it shows in so many frames: fewer may be a fault of mask or pose.
+# A Gaussian counts as seen if it shows in this many frames: fewer may be an error of a mask or pose.
 _LEAST_FRAMES = 3
-# Where one of those that have come to show is put back the next may show, so they are looked at again.
+# Putting one back may reveal the next, so they are checked again.
 _PASSES = 3
-# The pictures of so many frames are kept to hold the object by.
+# Number of frames that hold the object.
 _HOLDING_FRAMES = 60
 
 
@@ -86,7 +86,7 @@ def guide_scene(
         scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
     detail = scene.object_splats
     if resume is not None:
-        # What was seen, and how well it showed, is told by the object as the stage found it.
+        # What was seen, and how well, is measured on the object as the stage found it.
         resume = {**resume, "reached": {name: getattr(detail, name).clone() for name in resume["found"]}}
         detail.load_state_dict({**detail.state_dict(), **resume["found"]})
     coverage, orbit = scene_coverage(scene, evidence)
@@ -102,7 +102,7 @@ def guide_scene(
             f"times as wrong as on its own meshes ({stage.unlike} is allowed)"
         )
         return CompletedScene(reason, facts)
-    # What shows in any frame stays, even where too few show it to be sure of it.
+    # What shows in any frame stays, even if too few frames show it to be sure.
     held = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
     if held.seen.all():
         return CompletedScene("all of the object's Gaussians show", facts)

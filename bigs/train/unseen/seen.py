@@ -15,11 +15,11 @@ from bigs.models.scene import Scene, concatenate
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.types import Entity
 
-# Poses are wrong by about so much, metres.
+# Typical error of poses, metres.
 _TOLERANCE = 0.006
-# A Gaussian that weighs so much in some frame's picture, in pixels, shows.
+# A Gaussian with at least this weight in some frame's picture, in pixels, shows.
 SHOWS = 0.002
-# Frames on which errors are measured.
+# Number of frames on which errors are measured.
 _GUARD_FRAMES = 12
 
 

@@ -14,7 +14,7 @@ from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage
 from bigs.train.unseen.completed_scene import CompletedScene, complete_scene
 from bigs.train.unseen.guided_scene import guide_scene
 
-# The size at which the guard over what was seen looks.
+# Image size at which errors of the seen part are measured.
 _OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
 
 
