@@ -14,6 +14,8 @@ __all__ = [
     "fma_peak_gflops",
     "harmonics_backward",
     "harmonics_forward",
+    "pose_backward",
+    "pose_forward",
     "rasterize_backward",
     "rasterize_forward",
     "simd_level",
@@ -96,6 +98,37 @@ def harmonics_backward(
     degree: int, arrays: _HarmonicsArrays, v_colors: NDArray[Any], wanted: list[bool]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Flat gradients of dirs and coeffs; what is not wanted is an empty array."""
+
+# Of a subject: points [N, 3] or [B, N, 3], weights [N, K], bones [B, K, 3 or 4, 4], quats [N, 4] or None,
+# albedo [N, 3] or None, parts [N, J] or None, shade [B, 4 + J] or None, whether it is mirrored.
+_Posing = tuple[
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any],
+    NDArray[Any] | None,
+    NDArray[Any] | None,
+    NDArray[Any] | None,
+    NDArray[Any] | None,
+    bool,
+]
+
+def pose_forward(
+    frames: int, subjects: list[_Posing], clip: NDArray[Any] | None, labels: bool
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Flat means, quats and colours of all subjects in `frames` frames; clip is [8, 3]."""
+
+def pose_backward(
+    frames: int,
+    subjects: list[_Posing],
+    clip: NDArray[Any] | None,
+    labels: bool,
+    pulls: list[NDArray[Any] | None],
+    wanted: list[list[bool]],
+) -> tuple[list[tuple[NDArray[Any], ...]], NDArray[Any]]:
+    """Flat gradients of each subject's points, weights, bones, quats, albedo and shade, and of clip.
+
+    `pulls` are those of means, quats and colours; what is not wanted is an empty array.
+    """
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

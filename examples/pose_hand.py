@@ -23,10 +23,9 @@ from torch import Tensor
 
 from bigs.export.mesh import save_mesh
 from bigs.hand import HandModel, load_hand_models
-from bigs.models.hand_splats import HandSplats, HandSplatsConfig, pose_hand
-from bigs.models.lighting import light
+from bigs.models.hand_splats import HandSplats, HandSplatsConfig, rest_points
 from bigs.models.poses import HandFrames
-from bigs.models.scene import concatenate
+from bigs.models.posing import hand_part, pose_parts
 from bigs.raster import rasterization
 from bigs.viewer.preview import contact_sheet, save_picture
 
@@ -61,8 +60,11 @@ def main(
     with torch.no_grad():
         # The fields are fresh, so they reproduce the template; trained ones are used in the same way.
         canonical = HandSplats(right, HandSplatsConfig())()
-        pair = concatenate(pose_hand(right, canonical, betas, frames, side) for side in ("right", "left"))
-        lit = light(pair, from_above(), torch.zeros(len(stages), 4))
+        bones = right.skeleton(betas, frames.hand_pose, frames.global_orient, frames.wrist).bone_transforms
+        points = rest_points(canonical, betas, frames.hand_pose)
+        pair = [hand_part(canonical, points, bones, side) for side in ("right", "left")]
+        no_parts, no_shade = torch.zeros(len(canonical.points), 0), torch.zeros(len(stages), 4)
+        lit = pose_parts((part.lit(no_parts, no_shade) for part in pair), from_above())
         K = torch.tensor([[1.1 * width, 0.0, width / 2], [0.0, 1.1 * width, height / 2], [0.0, 0.0, 1.0]])
         colors, _, _ = rasterization(
             *lit, torch.eye(4)[None], K[None], width, height, backgrounds=torch.full((1, 3), 0.92)

@@ -47,6 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "_raster": {"raster"},  # the compiled module's stub names the settings class
     "geometry": BELOW,
     "raster": BELOW | {"geometry", "_raster"},
+    "fused": {"_raster"},
     "hand": BELOW | {"geometry"},
     "fields": BELOW | {"geometry"},
     "losses": BELOW | {"geometry"},
@@ -57,7 +58,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "motion": BELOW | {"geometry", "colmap"},
     "preprocess": BELOW | {"geometry", "hand", "data", "colmap", "motion"},
     "viewer": {"types", "checks", "atomic"},
-    "models": BELOW | {"geometry", "hand", "fields"},
+    "models": BELOW | {"geometry", "fused", "hand", "fields"},
 }
 MAY_IMPORT["train"] = {
     *MAY_IMPORT["models"],

@@ -6,8 +6,9 @@ import torch
 
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.hand import HandModel
+from bigs.models.canonical import CanonicalHand
 from bigs.models.free_gaussians import FreeGaussians
-from bigs.models.hand_splats import CanonicalHand, HandSplats
+from bigs.models.hand_splats import HandSplats
 
 
 class HandDetail(FreeGaussians):

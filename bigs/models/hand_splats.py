@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import scipy.spatial
@@ -12,11 +11,14 @@ from torch import Tensor, nn
 
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder, SkinningDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
+from bigs.fused.posing import skin
 from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
-from bigs.geometry.rotations import left_products, matrix_to_quat, quat_multiply
-from bigs.hand import HandModel, mirror_points, skin_points
+from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.hand import HandModel
 from bigs.hand.lbs import pose_corrective
+from bigs.models.canonical import CanonicalHand
 from bigs.models.poses import HandFrames
+from bigs.models.posing import hand_part, pose_parts
 from bigs.types import Gaussians, Side
 
 
@@ -43,19 +45,6 @@ class HandSplatsConfig:
     max_offset: float = 0.003
     # The mean colour of skin under white light; only a start, since a stage may take the images' own.
     color: tuple[float, float, float] = (0.7, 0.55, 0.45)
-
-
-class CanonicalHand(NamedTuple):
-    """N Gaussians of the right hand before shaping and posing."""
-
-    points: Tensor  # [N, 3] metres, mean shape, rest pose
-    shapedirs: Tensor  # [N, 3, 10]
-    posedirs: Tensor | None  # [N, 3, 135]; None when the model has none
-    weights: Tensor  # [N, 16]
-    quats: Tensor | None  # [N, 4]; None for isotropic Gaussians
-    scales: Tensor  # [N, 3]
-    opacities: Tensor  # [N]
-    colors: Tensor  # [N, D]
 
 
 class HandSplats(nn.Module):
@@ -178,37 +167,22 @@ def pose_splats(
     hand: CanonicalHand, betas: Tensor, hand_pose: Tensor, bones: Tensor, side: Side
 ) -> Gaussians:
     """The same along bones [B, 16, 4, 4] that are known; hand_pose [B, 15, 3, 3] is for the correctives."""
+    return skin_hand(hand, rest_points(hand, betas, hand_pose), bones, side)
+
+
+def rest_points(hand: CanonicalHand, betas: Tensor, hand_pose: Tensor) -> Tensor:
+    """Shaped points [N, 3] before skinning, or [B, N, 3] where fingers [B, 15, 3, 3] correct them."""
     points = hand.points + hand.shapedirs @ betas
-    if hand.posedirs is not None:
-        points = points + pose_corrective(hand.posedirs, hand_pose)
-    return skin_hand(hand, points, bones, side)
+    return points if hand.posedirs is None else points + pose_corrective(hand.posedirs, hand_pose)
 
 
 def skin_hand(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) -> Gaussians:
     """Carry shaped rest points [N, 3] or [B, N, 3] along the bones [B, 16, 4, 4] of B frames."""
-    means = skin_points(points, hand.weights, bones)
-    if hand.quats is None:
-        quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(hand.scales), 4)
-    else:
-        quats = turn_quats(hand.quats, hand.weights, bones)
-    if side == "left":
-        means = mirror_points(means)
-        # S R S for S = diag(-1, 1, 1): the same turn as seen in the mirror.
-        quats = quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
-    return Gaussians(means, quats, hand.scales, hand.opacities, hand.colors)
-
-
-def turn_quats(quats: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
-    """Orientation [B, N, 4] of skinned Gaussians: quats [N, 4] turned by the bones' blended quaternions.
-
-    The blend is the sum weighted by [N, 16], signs aligned: cheaper than a matrix-to-quaternion conversion a
-    Gaussian and frame, and equal to it where one bone rules. The result need not be unit. As in
-    `skin_points`, one matrix product over (bone, part of the quaternion) pairs does it all.
-    """
-    bones = matrix_to_quat(bone_transforms[..., :3, :3])
-    aligned = torch.where((bones * bones[:, :1]).sum(-1, keepdim=True) < 0, -bones, bones)
-    features = (weights[:, :, None] * quats[:, None, :]).flatten(1)
-    return features @ left_products(aligned).transpose(-1, -2).flatten(1, 2)
+    part = hand_part(hand, points, bones, side)
+    if hand.quats is not None:
+        return pose_parts([part])
+    quats = points.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(hand.scales), 4)
+    return Gaussians(skin(part.posing), quats, hand.scales, hand.opacities, hand.colors)
 
 
 def neighbour_weights(points: np.ndarray, verts: Tensor, lbs_weights: Tensor, neighbours: int = 6) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -9,10 +10,10 @@ import torch
 from torch import Tensor
 
 from bigs.hand import Skeleton, mirror_points
-from bigs.models.hand_splats import CanonicalHand, pose_splats
-from bigs.models.lighting import third_axis
-from bigs.models.object_splats import CanonicalObject, pose_object
+from bigs.models.canonical import CanonicalHand, CanonicalObject
+from bigs.models.hand_splats import pose_splats, rest_points
 from bigs.models.poses import HandFrames, ObjectFrames
+from bigs.models.posing import Part, hand_part, object_part, pose_parts
 from bigs.types import Entity, Gaussians, Side
 
 if TYPE_CHECKING:
@@ -80,25 +81,32 @@ class Moments:
         pose = self.object
         return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
-    def posed(self, entity: Entity, canonical: CanonicalHand | CanonicalObject) -> Gaussians:
-        """Gaussians of one entity in camera space, lit: means [B, N, 3], quats [B, N, 4]."""
-        lighting, normals = self._scene.lighting, None
-        if entity == "object":
-            posed = pose_object(canonical, self.object)
-            if lighting is not None:
-                # One matrix product instead of a formula per frame.
-                normals = third_axis(canonical.quats) @ self.object.rotations.transpose(-1, -2)
-        else:
-            posed = self.posed_hand(entity, canonical)
-        if lighting is None:
-            return posed
-        # Light does not change how a hand bends.
-        return lighting(entity, posed, self.frames, canonical.weights.detach(), normals)
+    def posed(
+        self, canonical: Mapping[Entity, CanonicalHand | CanonicalObject], labels: bool = False
+    ) -> Gaussians:
+        """Gaussians of some entities in camera space, lit: means [B, N, 3], quats [B, N, 4].
+
+        With `labels`, colours go on with a channel for each entity, in the order of `canonical`.
+        """
+        lighting = self._scene.lighting
+        parts = [self._part(entity, splats) for entity, splats in canonical.items()]
+        return pose_parts(parts, None if lighting is None else lighting.clip, labels)
 
     def posed_hand(self, side: Side, hand: CanonicalHand) -> Gaussians:
         """Any Gaussians of the canonical hand, unlit."""
         bones, betas = self._skeleton(side).bone_transforms, self._scene.hand_betas(side)
         return pose_splats(hand, betas, self.hand(side).hand_pose, bones, side)
+
+    def _part(self, entity: Entity, canonical: CanonicalHand | CanonicalObject) -> Part:
+        if entity == "object":
+            part = object_part(canonical, self.object)
+        else:
+            points = rest_points(canonical, self._scene.hand_betas(entity), self.hand(entity).hand_pose)
+            part = hand_part(canonical, points, self._skeleton(entity).bone_transforms, entity)
+        lighting = self._scene.lighting
+        if lighting is None:
+            return part
+        return part.lit(canonical.weights, lighting.shade[entity][self.frames])
 
     def _skinned(self, side: Side, vertices: Tensor | None) -> Tensor:
         skeleton, pose = self._skeleton(side), self.hand(side).hand_pose

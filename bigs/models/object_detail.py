@@ -7,9 +7,9 @@ from torch import Tensor
 
 from bigs.checks import InputError
 from bigs.geometry.rotations import quat_to_matrix
+from bigs.models.canonical import CanonicalObject
 from bigs.models.free_gaussians import FreeGaussians
 from bigs.models.lighting import N_PARTS
-from bigs.models.object_splats import CanonicalObject
 
 # Neighbours this many standard deviations apart cover a surface evenly.
 _SIGMA_PER_SPACING = 0.6

@@ -12,9 +12,11 @@ from torch import Tensor, nn
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.mesh import frames_from_normals, point_spacing
-from bigs.geometry.rotations import left_products, matrix_to_quat, quat_multiply
+from bigs.geometry.rotations import matrix_to_quat, quat_multiply
+from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
 from bigs.models.poses import ObjectFrames
+from bigs.models.posing import object_part, pose_parts
 from bigs.types import Gaussians
 
 
@@ -32,19 +34,6 @@ class ObjectSplatsConfig:
     max_offset: float = 0.006
     # One scale for all three axes, as in the released code; the paper's Eq. 1 has three.
     isotropic: bool = False
-
-
-class CanonicalObject(NamedTuple):
-    """The object's Gaussians in its own frame, N of them."""
-
-    means: Tensor  # [N, 3] metres at the initial size, offsets included
-    offsets: Tensor  # [N, 3] what the field added to the start
-    quats: Tensor  # [N, 4]
-    scales: Tensor  # [N, 3]
-    opacities: Tensor  # [N]
-    colors: Tensor  # [N, 3]
-    normals: Tensor  # [N, 3] unit
-    weights: Tensor  # [N, 16] how far each belongs to the surface's regions; rows sum to one
 
 
 class Anchors(NamedTuple):
@@ -138,6 +127,4 @@ def region_weights(points: np.ndarray, normals: np.ndarray, count: int) -> np.nd
 
 def pose_object(obj: CanonicalObject, frames: ObjectFrames) -> Gaussians:
     """Carry the canonical Gaussians to B frames, in camera space."""
-    means = frames.scale * obj.means @ frames.rotations.transpose(-1, -2) + frames.centers[:, None]
-    quats = obj.quats @ left_products(matrix_to_quat(frames.rotations)).transpose(-1, -2)
-    return Gaussians(means, quats, frames.scale * obj.scales, obj.opacities, obj.colors)
+    return pose_parts([object_part(obj, frames)])

@@ -15,11 +15,11 @@ from bigs.checks import InputError
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
-from bigs.models.hand_splats import CanonicalHand, skin_hand
-from bigs.models.lighting import Lighting, light
-from bigs.models.object_splats import CanonicalObject, pose_object
+from bigs.models.canonical import CanonicalHand, CanonicalObject
+from bigs.models.lighting import Lighting
 from bigs.models.poses import ObjectFrames
-from bigs.models.scene import Scene, concatenate
+from bigs.models.posing import Part, hand_part, object_part, pose_parts
+from bigs.models.scene import Scene
 from bigs.names import check_name
 from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 
@@ -50,7 +50,7 @@ class HandPlayback:
     bones: Tensor  # [T, 16, 4, 4] of the canonical (right) hand, mirrored camera for a left hand
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
-    shade: Tensor  # [T, 4 + 16] see `lighting.light`
+    shade: Tensor  # [T, 4 + 16] see `lighting`
     # The same poses in that side's own MANO convention, x_cam = MANO(orient, pose, betas) + transl
     # about the rest wrist joint; a left hand's model is the mirrored right one.
     global_orient_aa: Tensor  # [T, 3]
@@ -103,7 +103,7 @@ class Playback:
     width: int
     height: int
     normalize_shift: tuple[float, ...]  # [3] of the clip's file; places HOLD's scaled space
-    light: Tensor | None  # [8, 3] the clip's light (see `lighting.light`); None: colours are fixed
+    light: Tensor | None  # [8, 3] the clip's light (see `lighting`); None: colours are fixed
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
 
@@ -138,9 +138,8 @@ class Playback:
             InputError: a frame that the clip has not.
         """
         index = self._index(frames)
-        return concatenate(
-            self._posed(entity, index) for entity in (self.entities if entities is None else entities)
-        )
+        chosen = self.entities if entities is None else entities
+        return pose_parts((self._part(entity, index) for entity in chosen), self.light)
 
     def at(self, frames: Iterable[int]) -> Playback:
         """Some frames as a playback of their own.
@@ -167,21 +166,17 @@ class Playback:
                 raise InputError(f"frames: expected numbers from 0 to {len(self) - 1}, found {frame}")
         return torch.tensor(numbers, dtype=torch.int64)
 
-    def _posed(self, entity: Entity, index: Tensor) -> Gaussians:
+    def _part(self, entity: Entity, index: Tensor) -> Part:
         subject = self.object if entity == "object" else self.hands[entity]
         if entity == "object":
             frames = ObjectFrames(subject.rotations[index], subject.centers[index], subject.scale)
-            posed = pose_object(subject.splats, frames)
+            part = object_part(subject.splats, frames)
         else:
             points = subject.splats.points
             if subject.splats.posedirs is not None:
                 points = points + pose_corrective(subject.splats.posedirs, subject.hand_pose[index])
-            posed = skin_hand(subject.splats, points, subject.bones[index], entity)
-        return (
-            posed
-            if self.light is None
-            else light(posed, self.light, subject.shade[index], subject.splats.weights)
-        )
+            part = hand_part(subject.splats, points, subject.bones[index], entity)
+        return part if self.light is None else part.lit(subject.splats.weights, subject.shade[index])
 
     def trajectory(self) -> HandObjectTrajectory:
         """Meshes and joints of every frame, camera space, metres."""

@@ -26,8 +26,7 @@ from bigs.checks import (
 )
 from bigs.checksum import checksum
 from bigs.files import check_regular, parse_json
-from bigs.models.hand_splats import CanonicalHand
-from bigs.models.object_splats import CanonicalObject
+from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
 from bigs.names import check_name
 from bigs.types import SIDES, Side

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
+from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.grasps import Grasps
-from bigs.models.hand_splats import CanonicalHand, HandSplats, pose_splats
+from bigs.models.hand_splats import HandSplats, pose_splats
 from bigs.models.lighting import Lighting
 from bigs.models.moments import Moments
-from bigs.models.object_splats import CanonicalObject, ObjectSplats
+from bigs.models.object_splats import ObjectSplats
 from bigs.models.poses import HandFrames, HandPoses, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
 
@@ -140,16 +141,3 @@ class Scene(nn.Module):
     def free_frames(self, side: Side) -> Tensor:
         """The frames in which a hand belongs to no grasp, rising."""
         return torch.nonzero(self.grasps[side].of_frame < 0).flatten()
-
-
-def concatenate(parts: Iterable[Gaussians]) -> Gaussians:
-    """Several subjects' Gaussians as one set; what has no batch axis in one and in another is repeated."""
-    parts = list(parts)
-    frames = parts[0].means.shape[0]
-    return Gaussians(
-        torch.cat([part.means for part in parts], dim=1),
-        torch.cat([part.quats.expand(frames, *part.quats.shape[-2:]) for part in parts], dim=1),
-        torch.cat([part.scales for part in parts]),
-        torch.cat([part.opacities for part in parts]),
-        torch.cat([part.colors for part in parts], dim=-2),
-    )

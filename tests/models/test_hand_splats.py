@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import scipy.spatial
 import torch
+from posing_twin import third_axis
 from small_scene import HAND, covariances, disturb, hand_model, rotations
 
+from bigs.fused.posing import Posing, pose
 from bigs.geometry.mesh import midpoint_subdivision, point_spacing, vertex_normals
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_quat, quat_to_matrix
 from bigs.hand import mirror_points
+from bigs.models.canonical import CanonicalHand
 from bigs.models.hand_splats import (
-    CanonicalHand,
     HandSplats,
     neighbour_weights,
     pose_hand,
     silhouette_hand,
     skin_hand,
-    turn_quats,
 )
-from bigs.models.lighting import third_axis
 from bigs.models.poses import HandFrames
 
 BETAS = torch.randn(10, generator=torch.Generator().manual_seed(0))
@@ -172,7 +172,8 @@ def test_bones_whose_quaternions_differ_in_sign_do_not_cancel() -> None:
     weights = torch.zeros(1, 16)
     weights[0, :2] = 0.5
     identity = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
-    blended = turn_quats(identity, weights, bones)[0, 0]
+    _, turned, _ = pose([Posing(torch.zeros(1, 3), weights, bones, identity, torch.ones(1, 3))], None, False)
+    blended = turned[0, 0]
     assert blended.norm() > 0.9
     between = axis_angle_to_matrix(torch.tensor([-1.6, 0.0, 0.0]))
     torch.testing.assert_close(quat_to_matrix(blended), between, atol=1e-6, rtol=0)

@@ -32,7 +32,7 @@ def looked_at(scene: Scene, moments) -> torch.Tensor:
     canonical = scene.canonical(scene.entities)
     total = torch.zeros(())
     for entity in scene.entities:
-        part = moments.posed(entity, canonical[entity])
+        part = moments.posed({entity: canonical[entity]})
         total = total + part.means.sin().sum() + part.quats.sin().sum() + part.colors.sin().sum()
         if entity != "object":
             total = total + moments.verts(entity).cos().sum() + moments.joints(entity).cos().sum()

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bigs.checks import InputError
+from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail, split_object
-from bigs.models.object_splats import CanonicalObject
 from bigs.raster import rasterization
 
 

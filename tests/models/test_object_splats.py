@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from posing_twin import third_axis
 from small_scene import OBJECT, OBJECT_RADIUS, covariances, disturb, object_splats, rotations
 
 from bigs.geometry.mesh import point_spacing
-from bigs.models.lighting import third_axis
 from bigs.models.object_splats import ObjectSplats, pose_object, region_weights
 from bigs.models.poses import ObjectFrames
 
@@ -76,7 +76,7 @@ def test_posing_is_a_similarity_transform(scale: float) -> None:
         linear = matrix[:3, :3]
         one = posed._replace(quats=posed.quats[t])
         torch.testing.assert_close(covariances(one), linear @ canonical @ linear.T, atol=1e-9, rtol=1e-4)
-    assert posed.colors is obj.colors and posed.opacities is obj.opacities
+    assert torch.equal(posed.colors, obj.colors) and torch.equal(posed.opacities, obj.opacities)
 
 
 def test_a_checkpoint_carries_the_start() -> None:

@@ -12,7 +12,6 @@ from small_scene import FRAMES, hand_model, make_scene
 from bigs.checks import InputError
 from bigs.models.playback import Playback, record
 from bigs.models.playback_file import FORMAT, load_playback, save_playback
-from bigs.models.scene import concatenate
 from bigs.types import HandObjectTrajectory
 
 NAMES = tuple(f"{10 + i:04d}" for i in range(FRAMES))
@@ -41,11 +40,11 @@ def test_a_recording_shows_what_the_scene_shows(pair) -> None:
     scene, playback = pair
     frames = torch.tensor([2, 0])
     canonical = scene.canonical(scene.entities)
-    expected = {entity: scene.at(frames).posed(entity, canonical[entity]) for entity in scene.entities}
+    expected = {entity: scene.at(frames).posed({entity: canonical[entity]}) for entity in scene.entities}
     assert playback.entities == scene.entities and len(playback) == FRAMES
     for entity in scene.entities:
         for name, value in playback.gaussians([2, 0], [entity])._asdict().items():
-            want = getattr(concatenate([expected[entity]]), name)
+            want = getattr(expected[entity], name)
             torch.testing.assert_close(value, want, atol=1e-6, rtol=1e-5, msg=f"{entity}: {name}")
     whole = playback.gaussians([2, 0])
     assert whole.means.shape[1] == sum(g.means.shape[1] for g in expected.values())

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from posing_twin import quadratic_basis, third_axis
 from small_scene import FRAMES, OBJECT_RADIUS, hand_model, make_scene, rotations
 
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.hand import mirror_points, mirror_rotation
 from bigs.models.hand_splats import pose_hand
-from bigs.models.scene import Scene, concatenate
-from bigs.types import Gaussians
+from bigs.models.scene import Scene
 
 ALL = torch.arange(FRAMES)
 
@@ -67,7 +67,7 @@ def test_any_subjects_make_a_scene(sides, with_object) -> None:
     assert scene.n_frames == FRAMES
     canonical = scene.canonical(scene.entities)
     for entity in scene.entities:
-        assert scene.at(ALL[:2]).posed(entity, canonical[entity]).means.shape[0] == 2
+        assert scene.at(ALL[:2]).posed({entity: canonical[entity]}).means.shape[0] == 2
 
 
 @torch.no_grad()
@@ -97,7 +97,7 @@ def test_a_left_hand_is_the_left_model_in_its_own_pose(scene: Scene) -> None:
 def test_gaussians_lie_on_the_mesh_of_their_hand(scene: Scene) -> None:
     canonical = scene.canonical(scene.entities)
     for side in scene.sides:
-        means = scene.at(ALL).posed(side, canonical[side]).means
+        means = scene.at(ALL).posed({side: canonical[side]}).means
         verts = scene.at(ALL).verts(side)
         # Offsets and insets are millimetres; the disturbed skinning adds some at the finger tips.
         assert (means - verts).norm(dim=-1).median() < 0.01
@@ -117,7 +117,7 @@ def test_object_points_and_the_objects_frame_are_inverse(scene: Scene) -> None:
     torch.testing.assert_close(back, surface.expand_as(back), atol=1e-6, rtol=0)
     assert scene.object_distance(back).abs().max() < 2e-3
     torch.testing.assert_close(
-        scene.at(ALL).posed("object", scene.canonical(["object"])["object"]).means,
+        scene.at(ALL).posed(scene.canonical(["object"])).means,
         scene.at(ALL).object_points(scene.object_splats().means),
     )
 
@@ -133,7 +133,7 @@ def test_the_objects_scale_cannot_be_seen() -> None:
     outlines, depths, sizes = [], [], []
     for log_scale in (0.0, 0.4, -0.7):
         scene.object_poses.log_scale.fill_(log_scale)
-        posed = scene.at(ALL).posed("object", scene.canonical(["object"])["object"])
+        posed = scene.at(ALL).posed(scene.canonical(["object"]))
         axes = quat_to_matrix(posed.quats) * posed.scales[..., None, :]
         ends = torch.cat([posed.means[..., None], posed.means[..., None] + axes], dim=-1).mT
         outlines.append(pixels(scene, ends))
@@ -149,45 +149,36 @@ def test_the_objects_scale_cannot_be_seen() -> None:
 def test_lighting_changes_colours_alone() -> None:
     scene = make_scene()
     canonical = scene.canonical(scene.entities)
-    lit = {entity: scene.at(ALL).posed(entity, canonical[entity]) for entity in scene.entities}
+    lit = {entity: scene.at(ALL).posed({entity: canonical[entity]}) for entity in scene.entities}
     lighting, scene.lighting = scene.lighting, None
     for entity, with_light in lit.items():
-        plain = scene.at(ALL).posed(entity, canonical[entity])
+        plain = scene.at(ALL).posed({entity: canonical[entity]})
         assert torch.equal(with_light.means, plain.means) and torch.equal(with_light.quats, plain.quats)
-        again = lighting(entity, plain, ALL, canonical[entity].weights)
-        torch.testing.assert_close(with_light.colors, again.colors)
+        normals, shade = third_axis(plain.quats), lighting.shade[entity]
+        power = quadratic_basis(normals) @ lighting.clip + shade[:, None, :1] + normals @ shade[:, 1:4, None]
+        power = power + canonical[entity].weights @ shade[:, 4:, None]
+        torch.testing.assert_close(with_light.colors, plain.colors * power.exp())
         assert with_light.colors.shape == (FRAMES, *plain.colors.shape)
         assert not torch.allclose(with_light.colors, plain.colors.expand_as(with_light.colors))
 
 
-def some_gaussians(count: int, frames: int, *, batched_quats: bool) -> Gaussians:
-    quats = torch.rand(count, 4)
-    return Gaussians(
-        torch.rand(frames, count, 3),
-        torch.rand(frames, count, 4) if batched_quats else quats,
-        torch.rand(count, 3),
-        torch.rand(count),
-        torch.rand(count, 3),
-    )
-
-
-def test_concatenation_keeps_order_and_repeats_what_has_no_frames() -> None:
-    a = some_gaussians(4, 3, batched_quats=True)
-    b = some_gaussians(2, 3, batched_quats=False)
-    both = concatenate(iter([a, b]))
-    assert torch.equal(both.means[:, :4], a.means) and torch.equal(both.means[:, 4:], b.means)
-    assert torch.equal(both.quats[:, :4], a.quats)
-    assert all(torch.equal(both.quats[t, 4:], b.quats) for t in range(3))
-    for name in ("scales", "opacities", "colors"):
-        assert torch.equal(getattr(both, name), torch.cat([getattr(a, name), getattr(b, name)]))
-    alone = concatenate([b])
-    assert alone.quats.shape == (3, 2, 4) and torch.equal(alone.colors, b.colors)
-
-
-def test_concatenation_of_lit_gaussians_joins_along_gaussians() -> None:
-    a, b = (some_gaussians(n, 3, batched_quats=True)._replace(colors=torch.rand(3, n, 3)) for n in (4, 2))
-    both = concatenate([a, b])
-    assert torch.equal(both.colors, torch.cat([a.colors, b.colors], dim=1))
+@torch.no_grad()
+def test_entities_posed_together_are_each_alone_with_a_label(scene: Scene) -> None:
+    canonical = scene.canonical(scene.entities)
+    together = scene.at(ALL).posed(canonical, labels=True)
+    first = 0
+    for place, entity in enumerate(scene.entities):
+        alone = scene.at(ALL).posed({entity: canonical[entity]})
+        own = slice(first, first + len(alone.opacities))
+        first = own.stop
+        for name in ("means", "quats"):
+            assert torch.equal(getattr(together, name)[:, own], getattr(alone, name))
+        for name in ("scales", "opacities"):
+            assert torch.equal(getattr(together, name)[own], getattr(alone, name))
+        assert torch.equal(together.colors[:, own, :3], alone.colors)
+        labels = torch.eye(len(scene.entities))[place]
+        assert (together.colors[:, own, 3:] == labels).all()
+    assert first == together.means.shape[1]
 
 
 @torch.no_grad()
@@ -197,7 +188,7 @@ def test_state_dict_restores_a_scene() -> None:
     assert not torch.equal(one.at(frames).verts("left"), other.at(frames).verts("left"))
     other.load_state_dict(one.state_dict(), strict=True)
     for entity in one.entities:
-        a, b = (s.at(frames).posed(entity, s.canonical([entity])[entity]) for s in (one, other))
+        a, b = (s.at(frames).posed(s.canonical([entity])) for s in (one, other))
         for x, y in zip(a, b, strict=True):
             assert torch.equal(x, y)
 
@@ -215,7 +206,7 @@ def test_posing_a_hand_through_the_scene_is_pose_hand(scene: Scene) -> None:
     pose = scene.hand_poses["right"](ALL)
     canonical = scene.canonical(["right"])["right"]
     direct = pose_hand(hand_model(rich=True), canonical, scene.betas["right"], pose, "right")
-    assert torch.equal(scene.at(ALL).posed("right", canonical).means, direct.means)
+    assert torch.equal(scene.at(ALL).posed({"right": canonical}).means, direct.means)
     turned = rotations(FRAMES, seed=99)
     other = pose_hand(
         hand_model(rich=True), canonical, scene.betas["right"], pose._replace(global_orient=turned), "right"

@@ -13,9 +13,9 @@ from bigs.geometry.mesh import frames_from_normals, sample_surface, vertex_norma
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.guidance import Conditions
 from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
+from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
 from bigs.models.object_detail import ObjectDetail, split_object
-from bigs.models.object_splats import CanonicalObject
 from bigs.raster import RasterSettings
 from bigs.train.unseen.guided import render_object
 

@@ -32,8 +32,8 @@ from bigs.guidance.pixel import PIXELS, PixelConfig, PixelDenoiser, PixelNet
 from bigs.guidance.pixel_file import save_pixel_net
 from bigs.guidance.pixel_training import Pictures, PixelTraining, PixelTrainingConfig
 from bigs.guidance.residual import picture_residual
+from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
-from bigs.models.object_splats import CanonicalObject
 from bigs.raster.settings import RasterSettings
 from bigs.train.unseen.guided import render_object
 

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from bigs.geometry.rotations import quat_to_matrix
-from bigs.models.object_splats import Anchors, CanonicalObject
+from bigs.models.canonical import CanonicalObject
+from bigs.models.object_splats import Anchors
 
 # The two parts of a Gaussian are shorter by this factor, as in 3DGS.
 _SHORTER = 1.6

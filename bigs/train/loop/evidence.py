@@ -10,7 +10,8 @@ from torch import Tensor
 
 from bigs.data.base import Clip
 from bigs.losses.perceptual import VggWeights
-from bigs.models.hand_splats import CanonicalHand, silhouette_hand
+from bigs.models.canonical import CanonicalHand
+from bigs.models.hand_splats import silhouette_hand
 from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch

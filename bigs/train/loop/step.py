@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from bigs.losses.perceptual import VggWeights
-from bigs.models.hand_splats import CanonicalHand
+from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.moments import Moments
-from bigs.models.object_splats import CanonicalObject
-from bigs.models.scene import Scene, concatenate
+from bigs.models.scene import Scene
 from bigs.raster import rasterization
 from bigs.raster.api import Means2d
 from bigs.raster.settings import RasterSettings
@@ -147,7 +146,7 @@ class Step:
         """One subject rendered without the others (the paper's single-subject step)."""
         if entity not in self._alone:
             frames = self.frames_of(entity)
-            posed = self.clip.at(frames).posed(entity, self.canonical[entity])
+            posed = self.clip.at(frames).posed({entity: self.canonical[entity]})
             if self.selection.pull and entity == "object":
                 self._alone[entity] = self.render(posed, "full")
                 self._alone[entity].info["means2d"].retain_grad()
@@ -177,15 +176,8 @@ class Step:
     @cached_property
     def together(self) -> RenderOutput:
         """All subjects in one pass; after the three colours, one label channel per entity if labels count."""
-        labels = torch.eye(len(self.entities))
-        parts = []
-        for entity, label in zip(self.entities, labels, strict=True):
-            part = self.clip.at(self.frames).posed(entity, self.canonical[entity])
-            if self.selection.labels:
-                channels = torch.cat([part.colors, label.expand(*part.colors.shape[:-1], -1)], dim=-1)
-                part = part._replace(colors=channels)
-            parts.append(part)
-        return self.render(concatenate(parts))
+        canonical = {entity: self.canonical[entity] for entity in self.entities}
+        return self.render(self.clip.at(self.frames).posed(canonical, self.selection.labels))
 
     @cached_property
     def pixels(self) -> Pixels:

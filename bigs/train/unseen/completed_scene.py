@@ -15,8 +15,9 @@ from bigs.geometry.mesh import face_areas, frames_from_normals, point_spacing, s
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.geometry.surface import extract_mesh
 from bigs.geometry.symmetry import SeenSurface, Symmetry, completed
+from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail, replace_gaussians, split_object
-from bigs.models.object_splats import CanonicalObject, ObjectSplatsConfig
+from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
 from bigs.train.plan.config import CompletionStage

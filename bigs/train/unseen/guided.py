@@ -22,8 +22,8 @@ from bigs.guidance.cameras import (
 from bigs.guidance.denoiser import Conditions, Denoiser
 from bigs.guidance.schedule import SdsConfig
 from bigs.guidance.sds import sds_loss
+from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail
-from bigs.models.object_splats import CanonicalObject
 from bigs.raster import rasterization
 from bigs.raster.settings import RasterSettings
 from bigs.train.loop.run_stage import StageState

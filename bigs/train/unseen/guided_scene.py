@@ -11,8 +11,8 @@ from torch import Tensor
 from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
 from bigs.guidance.denoiser import Conditions, Denoiser
 from bigs.guidance.residual import picture_residual
+from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail, split_object
-from bigs.models.object_splats import CanonicalObject
 from bigs.models.scene import Scene
 from bigs.raster.settings import RasterSettings
 from bigs.train.loop.step import Evidence, Selection, Step

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.losses.photometric import masked_l1
-from bigs.models.object_splats import CanonicalObject
-from bigs.models.scene import Scene, concatenate
+from bigs.models.canonical import CanonicalObject
+from bigs.models.scene import Scene
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.types import Entity
 
@@ -56,13 +56,12 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
     most = torch.zeros(len(ink))
     for frame in torch.arange(scene.n_frames)[:, None]:
         step = Step(scene, evidence, canonical, Selection(frame, scene.entities, labels=False))
-        parts = []
-        for entity in scene.entities:
-            with torch.no_grad():
-                part = scene.at(frame).posed(entity, canonical[entity])
-            colors = ink[None] if entity == "object" else torch.zeros(1, len(part.opacities), 1)
-            parts.append(part._replace(colors=colors))
-        (weights,) = torch.autograd.grad(step.render(concatenate(parts)).colors.sum(), ink)
+        with torch.no_grad():
+            posed = scene.at(frame).posed(canonical)
+        others = torch.zeros(len(posed.opacities) - len(ink), 1)
+        # The object is the last of a scene's entities.
+        picture = step.render(posed._replace(colors=torch.cat([others, ink])))
+        (weights,) = torch.autograd.grad(picture.colors.sum(), ink)
         most = torch.maximum(most, weights[:, 0])
     return most
 

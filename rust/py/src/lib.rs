@@ -2,6 +2,7 @@
 
 mod convert;
 mod measure;
+mod pose;
 mod sh;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -317,6 +318,8 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(measure::simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(sh::harmonics_forward, m)?)?;
     m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(pose::pose_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(pose::pose_backward, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
     m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }

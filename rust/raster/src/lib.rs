@@ -143,8 +143,14 @@ pub use math::real::Real;
 pub use memory::pool::release_memory;
 pub use pipeline::scalar::Scalar;
 #[doc(hidden)]
+pub use simd::Vectors;
+#[doc(hidden)]
+pub use simd::level::{Simd, SimdLevel, Work};
+#[doc(hidden)]
 pub use simd::peak;
 pub use simd::peak::{simd_level, simd_levels};
+#[doc(hidden)]
+pub use simd::vector::Vector;
 
 /// The README's code is compiled and run with the documentation's.
 #[cfg(doctest)]

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_quat
-from bigs.models.object_splats import Anchors, CanonicalObject
+from bigs.models.canonical import CanonicalObject
+from bigs.models.object_splats import Anchors
 from bigs.train.loop.density import DensifyConfig, Pull, densified, fates, object_radius
 
 # Thresholds in round numbers, on an object of radius 1.

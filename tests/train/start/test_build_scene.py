@@ -114,7 +114,7 @@ def test_start_values_render_where_the_masks_are(scene: Scene, tiny: Clip) -> No
     for t in range(0, len(tiny), 4):
         labels = tiny.mask(t)
         for entity in scene.entities:
-            posed = scene.at(torch.tensor([t])).posed(entity, canonical[entity])
+            posed = scene.at(torch.tensor([t])).posed({entity: canonical[entity]})
             out = rasterization(*posed, torch.eye(4)[None], scene.K[None], scene.width, scene.height)
             alpha = out.alphas[0, 0, ..., 0].numpy() > 0.5
             own, others = labels == MASK_VALUES[entity], (labels != 0) & (labels != MASK_VALUES[entity])

@@ -41,7 +41,8 @@ pub trait Work {
 
 /// One of the levels that the kernels are compiled for.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum SimdLevel {
+#[allow(private_interfaces, unreachable_pub)]
+pub enum SimdLevel {
     /// What the target guarantees: SSE2 on x86-64, without fused multiply-add; NEON on ARM; else no vectors.
     Baseline(Baseline),
     /// 256-bit vectors with fused multiply-add.
@@ -57,7 +58,8 @@ impl SimdLevel {
     ///
     /// # Errors
     /// `BIGS_RASTER_SIMD` names a level that there is not, or that this machine does not have.
-    pub(crate) fn chosen() -> Result<Self, RasterError> {
+    #[allow(unreachable_pub)]
+    pub fn chosen() -> Result<Self, RasterError> {
         static LEVEL: OnceLock<Result<SimdLevel, RasterError>> = OnceLock::new();
         let choose =
             || Self::named(std::env::var_os(VARIABLE).map(|name| name.to_string_lossy().into_owned()));
@@ -108,7 +110,8 @@ impl SimdLevel {
 
     /// Does the work at this level.
     #[inline(always)]
-    pub(crate) fn run<W: Work>(self, work: W) -> W::Output {
+    #[allow(unreachable_pub)]
+    pub fn run<W: Work>(self, work: W) -> W::Output {
         match self {
             Self::Baseline(simd) => simd.run(work),
             #[cfg(target_arch = "x86_64")]

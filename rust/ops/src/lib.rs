@@ -1,0 +1,25 @@
+//! What a step of fitting hands and an object does around the renderer: posing Gaussians, comparing images, measuring
+//! distances, turning joints. Each is one pass over its data, with its gradient derived by hand, for `f32` and `f64`
+//! from the same source.
+//!
+//! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
+//! shared among rayon's threads in pieces of a fixed size, and sums have a fixed order, so that the number of threads
+//! changes no bit.
+
+#![forbid(unsafe_code)]
+#![cfg_attr(
+    not(test),
+    warn(
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::todo,
+        clippy::unimplemented
+    )
+)]
+
+mod checks;
+mod lanes;
+pub mod pose;
+
+pub use bigs_raster::RasterError as OpsError;
