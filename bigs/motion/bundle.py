@@ -22,13 +22,13 @@ from bigs.motion.schur import Sightings, System, linearise, point_steps, reduce,
 class BundleConfig:
     """Scales of the Cauchy losses, and when to stop."""
 
-    pixel_sigma: float = 0.25  # of a reprojection error, pixels
-    turn_sigma: float = 0.3  # of the change of angular velocity, degrees a frame and frame
-    shift_sigma: float = 0.0015  # of the change of velocity, in depths a frame and frame
-    # Poses that were known before lose weight from so many standard deviations on.
+    pixel_sigma: float = 0.25  # standard deviation of a reprojection error, pixels
+    turn_sigma: float = 0.3  # the same of the change of angular velocity, degrees per frame and frame
+    shift_sigma: float = 0.0015  # the same of the change of velocity, in depths per frame and frame
+    # Given poses lose weight beyond this many standard deviations.
     anchor_outlier: float = 3.0
     iterations: int = 15
-    # Stop when a step lowers the cost by less than this share of it.
+    # Stop if a step lowers the cost by less than this share.
     tolerance: float = 1e-4
 
 
@@ -57,8 +57,8 @@ class Anchor(NamedTuple):
     rotations: np.ndarray  # [T, 3, 3] object to camera
     transl: np.ndarray  # [T, 3]
     trust: np.ndarray  # [T] in [0, 1]; a frame of 0 has none
-    turn_sigma: float  # radians, about each axis
-    shift_sigma: np.ndarray  # [3] by the camera's axes
+    turn_sigma: float  # standard deviation about each axis, radians
+    shift_sigma: np.ndarray  # [3] standard deviations along the camera's axes
 
 
 def adjust(
@@ -112,7 +112,7 @@ def pose_covariances(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor
     problem = _problem(bundle, K, config, np.ones(frames, dtype=bool), anchor)
     matrix = reduce(_linearise(problem, bundle), problem.seen, 0.0).matrix
     covariance = np.linalg.inv(matrix)
-    # What the gauge may do to all poses: seven columns. Frames that are known well say where it is.
+    # The gauge's effect on all poses: seven columns, weighted so that well-known frames fix it.
     gauge = np.zeros((frames, 6, 7))
     gauge[:, :3, :3] = bundle.rotations
     gauge[:, 3:, 3:6] = bundle.rotations
@@ -136,7 +136,7 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
     covariance = np.linalg.pinv(reduced.matrix, rcond=1e-10, hermitian=True)
     blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
     own = np.einsum("titi->t", blocks)
-    # A turn of frame s by d is seen in frame t as the same turn of the object, carried along.
+    # A rotation of frame s by d is seen in frame t as the same rotation of the object, carried along.
     carry = np.einsum("tij,skj->tsik", bundle.rotations, bundle.rotations)
     cross = np.einsum("tisj,tsij->ts", blocks, carry)
     return np.degrees(np.sqrt((own[:, None] + own - 2.0 * cross).clip(0.0)))

@@ -14,7 +14,7 @@ from PIL import Image
 
 from bigs.colmap import pycolmap
 
-# Pixels of surroundings that a crop keeps, so that features at the object's border have their full patch.
+# Margin of a crop in pixels, so that features at the object's border have their full patch.
 _MARGIN = 12
 
 
@@ -22,11 +22,11 @@ _MARGIN = 12
 class FeatureConfig:
     """How features are found; lengths in pixels are of the clip's images."""
 
-    # The object's crop is enlarged by this before SIFT, which decides more than any other setting ...
+    # Factor by which the object's crop is enlarged before SIFT; it matters more than any other setting ...
     upscale: float = 2.0
-    # -1 lets SIFT double the crop once more, 0 takes a quarter of the time and finds half as many.
+    # -1 lets SIFT double the crop once more; 0 takes a quarter of the time and finds half as many.
     first_octave: int = -1
-    # ... but not beyond this many pixels on its long side, as in 4K video, which may be reduced instead.
+    # ... but not beyond this many pixels on its long side; larger crops, as from 4K video, may be reduced.
     max_side: int = 1200
     # A third of SIFT's usual contrast threshold: objects are small and evenly lit.
     peak_threshold: float = 0.002
@@ -39,7 +39,7 @@ class FrameFeatures(NamedTuple):
     pixels: np.ndarray  # [N, 2] column, row; the first pixel's centre is at (0.5, 0.5)
     sizes: np.ndarray  # [N] standard deviation of the blur at which it was found, pixels
     angles: np.ndarray  # [N] orientation, radians
-    descriptors: np.ndarray  # [N, 128] uint8, square roots of shares: their norm is 512
+    descriptors: np.ndarray  # [N, 128] uint8, square roots of shares with norm 512
 
 
 class _Crop(NamedTuple):
@@ -79,7 +79,7 @@ def extract_features(
     options.sift.peak_threshold = config.peak_threshold
     options.sift.first_octave = config.first_octave
     features = [NOTHING] * len(images)
-    # pycolmap uses all cores only on files.
+    # pycolmap uses all cores only when it reads files.
     with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder, quiet_colmap():
         crops = {}
         for t, (image, box) in enumerate(zip(images, boxes, strict=True)):

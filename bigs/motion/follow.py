@@ -21,23 +21,23 @@ from bigs.motion.patches import Laid, PatchConfig, Pictures, cut_templates, lay,
 class FollowConfig:
     """How features are followed; lengths in pixels of the clip's images."""
 
-    # Neighbours with this many matches need no more.
+    # Neighbours with this many matches are not followed.
     enough: int = 250
-    # From coarse to fine, each a reduction of the picture.
+    # Reductions of the picture, from coarse to fine.
     levels: tuple[int, ...] = (4, 2, 1)
-    # A patch has this many pixels on each side of its middle. In blurred and pale pictures 4 was too few.
+    # Pixels of a patch on each side of its middle. In blurred and pale pictures 4 was too few.
     half: int = 6
     iterations: int = 6
     likeness: float = 0.85
-    # A feature that is followed back must come out this near to where it began.
+    # A feature that is followed there and back must return this near to its start.
     there_and_back: float = 0.2
-    # Standard deviation of its place along the direction in which its patch says least.
+    # Standard deviation of its position along the direction in which its patch says least.
     most_unsure: float = 0.2
-    # Matches near a feature that tell where it goes at first.
+    # Number of nearby matches that predict where a feature goes.
     guides: int = 5
-    # What lands this near to a feature of that frame is that feature.
+    # A result this near to a feature of the other frame is that feature.
     same: float = 0.7
-    # Features that are followed from each frame, and how far they are apart.
+    # Number of features that are followed from each frame, and their spacing.
     most: int = 500
     apart: float = 2.0
 
@@ -70,7 +70,7 @@ def follow(
     )
     levels = [Pictures(images, masks, patch, coarser) for coarser in config.levels]
     features, united = list(features), dict(matches)
-    # Features that an earlier frame's lead to: these go on first.
+    # Features that were followed from an earlier frame are continued first.
     reached = np.zeros(0, dtype=int)
     for t in range(len(features) - 1):
         here, there = features[t], features[t + 1]
@@ -98,7 +98,7 @@ def _chosen(
     order = np.concatenate([reached, np.setdiff1d(np.arange(len(here.pixels)), reached)])
     if len(order) == 0:
         return order
-    # Each feature is near itself, too.
+    # Each feature is its own neighbour too.
     near = scipy.spatial.cKDTree(here.pixels).query_ball_point(here.pixels, config.apart)
     blocked = np.zeros(len(here.pixels), dtype=bool)
     for i in matched:

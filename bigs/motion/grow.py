@@ -23,7 +23,7 @@ from bigs.motion.refine import joined
 class GrowConfig:
     """How frames are added."""
 
-    # Frames that are adjusted together with a new one, and of these how many may still move.
+    # Number of frames that are adjusted together with a new one, and of those that may still move.
     window: int = 10
     moving: int = 4
     # Velocity is the mean over this many steps.
@@ -52,7 +52,7 @@ def grow(map_: ObjectMap, models: Sequence[PartialModel], config: GrowConfig) ->
         t, towards = _next_frame(map_)
         starts = [
             _predicted(map_, t, towards, config.memory),
-            # Where a motion turns back, going on leads astray.
+            # Where a motion reverses, extrapolation is wrong.
             (map_.rotations[t - towards].copy(), map_.transl[t - towards].copy()),
             _turned_back(map_, t, towards),
             *as_models_say(map_, t, towards, models),

@@ -18,11 +18,11 @@ from bigs.motion.features import FrameFeatures, quiet_colmap
 class MappingConfig:
     """Matching and incremental mapping; lengths in pixels are of the clip's images."""
 
-    # Each frame is matched with this many later ones, or with all: far pairs invite look-alike sides to be
-    # taken for one.
+    # Each frame is matched with this many later ones, or with all. Far pairs may confuse sides that look
+    # alike.
     pairs: Literal["sequential", "exhaustive"] = "sequential"
     overlap: int = 10
-    # How far a match may lie from its epipolar line, and a point from its pixel while a frame is added.
+    # Tolerances: of a match from its epipolar line, and of a point's projection while a frame is added.
     match_error: float = 1.5
     pose_error: float = 3.0
     point_error: float = 1.5
@@ -34,7 +34,7 @@ class MappingConfig:
     loss_scale: float = 0.5
     keep_error: float = 1.5
     keep_angle: float = 1.5
-    # Least matches of a pair, of a first pair, and of a frame that is added, and their share of all.
+    # Fewest matches of a pair, of a first pair, and of an added frame, and their share of all.
     pair_inliers: int = 15
     init_inliers: int = 100
     pose_inliers: int = 30
@@ -280,7 +280,7 @@ def _refine(reconstruction: pycolmap.Reconstruction, known_focal: bool, config: 
         pycolmap.ObservationManager(reconstruction).filter_all_points3D(config.keep_error, config.keep_angle)
 
 
-# With fewer points than this there is nothing to adjust.
+# With fewer points there is nothing to adjust.
 _FEWEST_POINTS = 30
 
 

@@ -17,16 +17,16 @@ from bigs.motion.tracks import Tracks
 class MapConfig:
     """What counts as a sighting, and how more of them are found; lengths in pixels of the clip's images."""
 
-    # A sighting that is further than this from its point's projection is no sighting.
+    # An observation further than this from its point's projection is wrong.
     keep_error: float = 2.0
-    # A point needs this many sightings, and rays that differ by this angle, degrees.
+    # A point needs this many observations, and rays that differ by this angle, degrees.
     least_sightings: int = 3
     least_angle: float = 2.0
-    # Known points are sought within this distance of where they should appear, ...
+    # Known points are searched within this distance of their projection, ...
     search_radius: float = 5.0
-    # ... from directions that differ by at most this angle from one they were seen from, degrees, ...
+    # ... in views that differ by at most this angle from one that saw them, degrees, ...
     search_angle: float = 40.0
-    # ... with descriptors whose angle is at most this, and this share of that of the next best.
+    # ... with descriptors within this angle, and within this share of the second best's.
     search_descriptor: float = 0.65
     search_ratio: float = 0.9
     bundle: BundleConfig = field(default_factory=BundleConfig)
@@ -40,7 +40,7 @@ class ObjectMap:
     ) -> None:
         """A map without poses and points; `tracks` hold the sightings of `features`, one entry per frame."""
         self.features, self.K, self.config = features, K, config
-        # Poses known before, of all frames; None where the pictures are all there is.
+        # Given poses of all frames; None if there are only pictures.
         self.anchor: Anchor | None = None
         frames = len(features)
         self.rotations = np.tile(np.eye(3), (frames, 1, 1))  # [T, 3, 3] object to camera
@@ -52,7 +52,7 @@ class ObjectMap:
         ).reshape(-1, 2)
         self.good = np.ones(len(self.frame), dtype=bool)  # [M] believed
         self.points = np.zeros((tracks.total, 3))
-        self.known = np.zeros(tracks.total, dtype=bool)  # which points have a place
+        self.known = np.zeros(tracks.total, dtype=bool)  # which points have been triangulated
 
     def restart(self, frames: np.ndarray, rotations: np.ndarray, transl: np.ndarray) -> None:
         """Forget all poses and points, believe every sighting, and start from the given frames' poses."""
@@ -215,7 +215,7 @@ class ObjectMap:
         here[self.track[self.good & (self.frame == t)]] = True
         taken = np.zeros(len(features.pixels), dtype=bool)
         taken[self.feature[self.good & (self.frame == t) & self.known[self.track]]] = True
-        # The sighting from the most similar direction speaks for its point.
+        # The observation from the most similar direction represents its point.
         rows &= ~here[self.track]
         if not rows.any() or taken.all():
             return 0
@@ -235,7 +235,7 @@ class ObjectMap:
         pixels = cam[:, :2] / cam[:, 2:] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
         new, found = self._recognised(t, tracks, best, pixels, np.flatnonzero(~taken))
         if len(new):
-            # A sighting of another, unplaced track gives way.
+            # An observation of another track that is not triangulated gives way.
             other = (self.frame == t) & np.isin(self.feature, new)
             self.good[other] = False
             self.frame = np.concatenate([self.frame, np.full(len(new), t)])
@@ -278,11 +278,11 @@ class ObjectMap:
         angle = angles[every, least]
         angles[every, least] = np.inf
         fits = (angle < config.search_descriptor) & (angle <= config.search_ratio * angles.min(1))
-        # A feature that several points want is the one's that it is most like.
+        # If several points claim a feature, the most similar one gets it.
         order = np.flatnonzero(fits)[np.argsort(angle[fits], kind="stable")]
         new, first = np.unique(free[near[order, least[order]]], return_index=True)
         return new, tracks[order[first]]
 
 
-# Features near where a point should appear that are looked at.
+# Number of features near a point's projection that are compared.
 _CANDIDATES = 16

@@ -27,26 +27,26 @@ from bigs.motion.object_map import ObjectMap
 class PatchConfig:
     """How patches are laid on frames; lengths in pixels of the clip's images, shrunk where they are."""
 
-    # Crops of the object with a longer side than this are shrunk by a whole number.
+    # Crops of the object with a longer side than this are shrunk by a whole factor.
     max_side: int = 1200
-    # A patch has this many pixels on each side of its middle, in pictures blurred by `blur`.
+    # Pixels of a patch on each side of its middle, in pictures blurred by `blur`.
     half: int = 4
     blur: float = 0.5
-    # Neighbours of a point that tell its plane.
+    # Number of neighbours of a point that determine its plane.
     neighbours: int = 14
-    # Least cosine between the plane's normal and the view.
+    # Smallest cosine between the plane's normal and the view.
     least_cosine: float = 0.2
-    # Share of a patch that must be on the object, ...
+    # Share of a patch that must lie on the object, ...
     least_shown: float = 0.7
-    # ... least correlation with what it is laid on, and how far it may be from where the map expects it.
+    # ... smallest correlation, and largest distance from where the map expects it.
     likeness: float = 0.8
     most_moved: float = 4.0
-    # Standard deviation of its place along the direction in which it says least.
+    # Standard deviation of its position along the direction in which it says least.
     most_unsure: float = 0.2
-    # Matches whose patch was not recognised count in frames with fewer recognised ones than this.
+    # Matches whose patch was not recognised count only in frames with fewer recognised ones than this.
     enough: int = 30
     iterations: int = 10
-    # How often all is measured and adjusted.
+    # Rounds of measuring and adjusting.
     passes: int = 3
 
 
@@ -75,14 +75,13 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         if measured is None:
             return
         found = measured
-        # Matches whose patch was not recognised stand for other places more often than not, but a frame may
-        # have nothing else.
+        # Most matches whose patch was not recognised are wrong, but a frame may have nothing else.
         poor = np.bincount(found.frame, minlength=len(frames)) < config.enough
         map_.replace_sightings(*_united(found, matched, poor))
         map_.judge()
         map_.adjust(frames, everything, map_.config.bundle)
         map_.judge()
-    # Where they agree with these poses they have a place all the same, and tie frames to each other.
+    # Where they agree with these poses they are kept, since they connect frames.
     map_.replace_sightings(*_united(found, matched, everything))
     map_.judge()
     map_.triangulate()
@@ -158,7 +157,7 @@ def _measured(
     mean_view = np.zeros_like(points)
     np.add.at(mean_view, point, views)
     normals = point_normals(points, mean_view, config.neighbours)
-    # The most frontal sighting of each point has its patch.
+    # The most frontal observation of each point provides its patch.
     facing = (views * normals[point]).sum(1)
     order = np.lexsort((facing, point))
     frontal = order[np.append(np.flatnonzero(np.diff(point[order])), len(order) - 1)]
@@ -177,7 +176,7 @@ def _measured(
         laid = lay(pictures, t, start, warp, Templates(*(part[rows] for part in templates)), config)
         rows = rows[laid.fits]
         found.append(Sightings(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits]))
-    # Its own sighting counts for a patch that was recognised elsewhere.
+    # A patch's own observation counts as recognised if it was recognised elsewhere.
     again = np.isin(tracks, np.concatenate([sightings.track for sightings in found]))
     found.append(Sightings(own[again], tracks[again], middle[again]))
     return Sightings(*(np.concatenate(part) for part in zip(*found, strict=True)))
@@ -239,7 +238,7 @@ class Laid(NamedTuple):
     """Patches as another frame shows them."""
 
     pixels: np.ndarray  # [N, 2]
-    fits: np.ndarray  # [N] (bool) which were recognised, and say where they are
+    fits: np.ndarray  # [N] (bool) which were recognised and located
 
 
 def lay(
@@ -266,7 +265,7 @@ def lay(
     slope = templates.slope / deviation[..., None]
     slope = slope - (weight[..., None] * slope).sum(1, keepdim=True)
     normal = torch.einsum("ns,nsi,nsj->nij", weight, slope, slope)
-    # An edge or an even patch leaves a direction open: there the map's word stands.
+    # An edge or a uniform patch leaves a direction open; there the map's prediction stands.
     size = normal.diagonal(dim1=1, dim2=2).sum(1)
     inverse = torch.linalg.inv(normal + (1e-3 * size + 1e-9)[:, None, None] * torch.eye(2))
     for _ in range(config.iterations):
@@ -281,7 +280,7 @@ def lay(
         & ((places - began).norm(dim=1) < config.most_moved)
         & (shown > config.least_shown)
     )
-    # What is unlike is taken for noise.
+    # Differences count as noise.
     noise = (2.0 * (1.0 - likeness)).clamp_min(1e-6) * (weight**2).sum(1)
     sigma = (noise / torch.linalg.eigvalsh(normal)[:, 0].clamp_min(1e-9)).sqrt()
     fits &= pictures.shrunk * sigma < config.most_unsure

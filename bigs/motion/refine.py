@@ -28,11 +28,12 @@ class RefineConfig:
     """How often, and what else is tried."""
 
     passes: int = 2
-    # Rounds of bundle adjustment of everything in each pass.
+    # Rounds of full bundle adjustment in each pass.
     rounds: int = 2
-    # A partial model whose turns differ from the map's by more than this is tried in its place, degrees, ...
+    # A partial model whose rotations differ from the map's by more than this is tried in its place, degrees,
+    # ...
     disagreement: float = 3.0
-    # ... joined to the map at its frame nearest to the start, and that many frames deeper.
+    # ... joined to the map at its frame nearest to the start, and this many frames further in.
     depths: tuple[int, ...] = (0, 3)
 
 
@@ -61,8 +62,7 @@ def refine(
         misfit = best.misfit()
         for part, rotations, transl in splices(map_, models, start, config):
             anew = _made_anew(map_, tracks, rotations, transl)
-            # A model that turns otherwise even from where the map takes it up was wrong itself, and what
-            # came of it is no better than chance.
+            # A model that differs even where the map joins it was wrong itself, and its result is chance.
             agrees = disagreement(anew.rotations, part).max() <= config.disagreement
             if agrees and anew.misfit() < misfit:
                 best, misfit = anew, anew.misfit()

@@ -14,33 +14,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Least sightings of a batch: few enough for arrays over them to stay in the processor's cache.
+# Smallest number of observations of a batch, so that arrays over them stay in the processor's cache.
 _BATCH = 8_000
 
-_Numbers = Sequence[np.ndarray] | np.ndarray  # of a vector's or a row's coordinates, each [m]
+_Numbers = Sequence[np.ndarray] | np.ndarray  # coordinates of a vector or of a row, each [m]
 
 
 class Sightings(NamedTuple):
     """What was seen where, by points of which all sightings are consecutive."""
 
-    order: np.ndarray  # [M] which sighting of the caller's each is
+    order: np.ndarray  # [M] index of each among the caller's observations
     frame: np.ndarray  # [M]
     point: np.ndarray  # [M] rank of the point
     pixels: np.ndarray  # [2, M]
-    points: np.ndarray  # [P] the caller's number of each point that was seen at all
+    points: np.ndarray  # [P] the caller's number of each observed point
     batches: list[_Batch]
 
 
 class _Batch(NamedTuple):
     """Some points with all their sightings."""
 
-    rows: slice  # of the sightings
-    points: slice  # of the ranks
-    starts: np.ndarray  # [n] where each point's sightings begin within the batch
-    moving: np.ndarray  # [m] sightings within the batch in frames that may move
-    slots: np.ndarray  # [F] the frames that may move, as the poses' equations count them
-    slot: np.ndarray  # [m] which of these each moving sighting is in
-    point: np.ndarray  # [m] which of the batch's points it shows
+    rows: slice  # range of observations
+    points: slice  # range of ranks
+    starts: np.ndarray  # [n] where each point's observations begin within the batch
+    moving: np.ndarray  # [m] observations within the batch in frames that may move
+    slots: np.ndarray  # [F] the frames that may move, by their index in the poses' equations
+    slot: np.ndarray  # [m] index of each such observation's frame among these
+    point: np.ndarray  # [m] index of its point within the batch
 
 
 class PointPart(NamedTuple):
@@ -48,7 +48,7 @@ class PointPart(NamedTuple):
 
     matrix: np.ndarray  # [n, 3, 3]
     gradient: np.ndarray  # [n, 3]
-    coupling: np.ndarray  # [6, 3, m] of moving sightings
+    coupling: np.ndarray  # [6, 3, m] of the observations in frames that may move
 
 
 class System(NamedTuple):
@@ -89,7 +89,7 @@ def sort_sightings(frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, fre
     slots = np.cumsum(free) - 1
     batches, began, row = [], 0, 0
     while began < len(points):
-        # As many points as frames, too: a batch's part is added to all pairs of its frames.
+        # Also at least as many points as frames, since a batch contributes to all pairs of its frames.
         until = max(int(np.searchsorted(ends, row + _BATCH)) + 1, began + len(free))
         until = min(until, len(points))
         rows = slice(row, int(ends[until - 1]))
@@ -191,7 +191,7 @@ def _add_poses(
     `slot` [m] is the pose of each sighting, `arm` the spoke from the object's origin to what was seen.
     """
     sums = lambda values: np.bincount(slot, values, poses.shape[2])  # noqa: E731
-    levers = [_cross(arm, row) for row in hessian]  # of a shift against a turn
+    levers = [_cross(arm, row) for row in hessian]  # of a shift relative to a rotation
     rows = [*_columns_crossed(arm, levers), *levers]
     for i, value in enumerate((*_cross(arm, pull), *pull)):
         gradient[i] += sums(value)
@@ -224,7 +224,7 @@ def reduce(system: System, seen: Sightings, damping: float) -> Reduced:
         dense = np.zeros((len(points), 3, width))
         blocks = dense.reshape(len(points), 3, len(batch.slots), 6)
         blocks[batch.point, :, batch.slot, :] = part.coupling.transpose(2, 1, 0)
-        # inverse = root rootᵀ, so that the product of one matrix with itself is all there is to do.
+        # inverse = root rootᵀ, so that a single product of a matrix with itself remains.
         root = np.linalg.cholesky(0.5 * (inverse + inverse.transpose(0, 2, 1)))
         scaled = (root.transpose(0, 2, 1) @ dense).reshape(-1, width)
         columns = (6 * batch.slots[:, None] + np.arange(6)).ravel()

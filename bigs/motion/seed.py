@@ -17,7 +17,7 @@ from bigs.motion.object_map import ObjectMap
 
 _FLIP = np.diag([1.0, 1.0, -1.0])
 
-# A change of angular velocity by more than this within one frame is no motion but an error, degrees.
+# A larger change of angular velocity within one frame is an error, degrees.
 _KINK = 2.5
 
 
@@ -26,9 +26,9 @@ class Seed(NamedTuple):
 
     frames: np.ndarray  # [F]
     rotations: np.ndarray  # [F, 3, 3]
-    transl: np.ndarray  # [F, 3], of the middle of the points
-    misfit: float  # of the map that grows from these frames alone
-    mirror_misfit: float  # the same of their mirror image
+    transl: np.ndarray  # [F, 3], positions of the middle of the points
+    misfit: float  # misfit of the map grown from these frames alone
+    mirror_misfit: float  # misfit of their mirror image
 
 
 def mirrored(rotations: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def smooth_runs(frames: np.ndarray, rotations: np.ndarray) -> list[np.ndarray]:
     steps = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1))
     velocity = steps.as_rotvec(degrees=True) / np.diff(frames)[:, None]
     kink = np.linalg.norm(np.diff(velocity, axis=0), axis=1) > _KINK
-    # A step is broken if frames are missing in it; a run ends at the middle of a kink.
+    # Missing frames break a run; a kink ends it at its middle.
     broken = np.diff(frames) > 1
     cut = broken.copy()
     cut[1:] |= kink

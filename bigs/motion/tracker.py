@@ -36,39 +36,37 @@ Matches = Mapping[tuple[int, int], np.ndarray]
 class TrackerConfig:
     """How tracks are found and weighed."""
 
-    # Poses are known roughly, so half as many features do, and patches place them anew in any case.
+    # Poses are roughly known, so half as many features suffice, and patches locate them again in any case.
     features: FeatureConfig = field(default_factory=lambda: FeatureConfig(first_octave=0))
     matching: MappingConfig = field(default_factory=MappingConfig)
     follow: FollowConfig = field(default_factory=FollowConfig)
     map: MapConfig = field(default_factory=MapConfig)
     patches: PatchConfig = field(default_factory=lambda: PatchConfig(passes=2))
-    # Each frame is matched with so many later ones, ...
+    # Each frame is matched with this many later ones, ...
     overlap: int = 6
-    # ... and with up to so many others that show it turned by less than this, degrees.
+    # ... and with up to this many others whose rotation differs by less than this, degrees.
     alike: int = 3
     alike_angle: float = 25.0
-    # A sighting contradicts its frame's given pose where it is off its track's point by so many times what
-    # is usual, and by so many pixels.
+    # An observation contradicts its frame's given pose if it is off by this many times the usual error and by
+    # this many pixels.
     contradiction: float = 4.0
     least_contradiction: float = 8.0
-    # Frames that share features show sides that are turned by no more than this, degrees.
+    # Frames that share features differ by no more than this rotation, degrees.
     most_turned: float = 50.0
-    # Factors on the map's scales in pixels, from the given poses' errors down.
+    # Factors on the map's scales in pixels, starting from the given poses' errors.
     reaches: tuple[float, ...] = (8.0, 3.0, 1.0)
     rounds: int = 1
-    # Errors of given poses before anything is known of them: degrees, and shares of the depth, across the
-    # ray and along it.
+    # Prior errors of given poses: degrees, and shares of the depth, across the ray and along it.
     turn_sigma: float = 3.0
     shift_sigma: tuple[float, float] = (0.015, 0.03)
-    # Sightings err together more than one by one: true errors are about so many times those of independent
-    # ones.
+    # Errors of observations are correlated: true errors are about this many times those of independent ones.
     caution: float = 3.0
-    # More, up to this, where poses leave the given ones for long by so many of these' standard deviations.
+    # Up to this factor where poses leave the given ones for long by this many of their standard deviations.
     most_caution: float = 48.0
     most_departure: float = 2.5
-    # So do given poses of neighbouring frames: where only they speak, smoothing them makes them no surer.
+    # Errors of neighbouring given poses are correlated too: smoothing them alone makes them no more certain.
     given_caution: float = 3.0
-    # A frame with fewer sightings tells nothing about the given poses' errors.
+    # A frame with fewer observations says nothing about the given poses' errors.
     least_sightings: int = 30
 
 
@@ -85,13 +83,13 @@ class TrackedMotion(NamedTuple):
 
     rotations: np.ndarray  # [T, 3, 3]
     transl: np.ndarray  # [T, 3]
-    covariance: np.ndarray  # [T, 6, 6] of turn (radians) and shift (metres) in the camera's axes
-    sightings: np.ndarray  # [T] of points in each frame
-    contradicted: np.ndarray  # [T] bool: matches refute the given pose
+    covariance: np.ndarray  # [T, 6, 6] of rotation (radians) and shift (metres) in the camera's axes
+    sightings: np.ndarray  # [T] number of points in each frame
+    contradicted: np.ndarray  # [T] bool: matches contradict the given pose
     points: np.ndarray  # [N, 3] metres
     colors: np.ndarray  # [N, 3] uint8
-    turn_sigma: float  # of the given poses, as found, radians
-    shift_sigma: np.ndarray  # [3] the same, metres
+    turn_sigma: float  # estimated error of the given rotations, radians
+    shift_sigma: np.ndarray  # [3] the same of positions, metres
 
 
 def track(
@@ -175,7 +173,7 @@ def _fused(map_: ObjectMap, config: TrackerConfig) -> BundleConfig:
     everything = np.ones(len(map_.posed), dtype=bool)
     caution, scales = config.caution, config.map.bundle
     while True:
-        # What lasts is no outlier of the given poses.
+        # A lasting departure is no outlier of the given poses.
         believed = replace(
             scales,
             pixel_sigma=caution * scales.pixel_sigma,
@@ -208,7 +206,7 @@ def pairs_to_match(given: GivenPoses, config: TrackerConfig) -> list[tuple[int, 
     """Neighbours, and for each frame those others that show the object from nearly the same side."""
     frames = len(given.rotations)
     pairs = {(a, b) for a in range(frames) for b in range(a + 1, min(a + 1 + config.overlap, frames))}
-    # What the camera sees does not depend on a turn about its own axis.
+    # A rotation about the camera's own axis does not change which side it sees.
     views = _views(given)
     cosine = views @ views.T
     for a in range(frames):
@@ -257,7 +255,7 @@ def contradicted_frames(
     agreed = (agreeing @ agreeing.T).toarray()
     speaks = shared >= config.matching.pair_inliers
     np.fill_diagonal(speaks, False)
-    # Nor is a feature found again from a side that is turned further than this.
+    # Features are not found again beyond this rotation.
     views = _views(given)
     good = speaks & (agreed > 0.5 * shared) & (views @ views.T > np.cos(np.radians(config.most_turned)))
     _, label = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_matrix(good), directed=False)
@@ -281,10 +279,10 @@ def _off_their_points(
     gather = scipy.sparse.csr_matrix(
         (np.ones(len(point)), (point, np.arange(len(point)))), (count, len(point))
     )
-    # Points are somewhere in the object: that keeps those in place whose rays are nearly parallel.
+    # Points lie in the object, which keeps those in place whose rays are nearly parallel.
     hold = 1e-3 * np.eye(3)
     weight = np.ones(len(point))
-    # From where all rays have a say down to where most agree.
+    # From a scale at which all rays count to one at which most agree.
     for scale in (100.0, 60.0, 40.0, 25.0, 15.0, 10.0, 10.0):
         matrix = (gather @ (weight[:, None] * across)).reshape(-1, 3, 3) + hold
         places = np.linalg.solve(matrix, (gather @ (weight[:, None] * aim))[..., None])[..., 0]
@@ -352,10 +350,10 @@ def measured_anchor(map_: ObjectMap, anchor: Anchor, config: TrackerConfig) -> A
 
 # Frames over which a departure is sustained.
 _WINDOW = 9
-# Fewer rays than this always meet nearly enough.
+# Fewer rays always meet nearly enough.
 _LEAST_RAYS = 4
-# Fewer frames than this do not measure an error.
+# Fewer frames do not measure an error.
 _FEWEST = 10
-# Poses are never believed beyond this: radians, and shares of the depth.
+# Poses are never believed to be more accurate than this: radians, and shares of the depth.
 _LEAST_TURN = 5e-4
 _LEAST_SHIFT = 2e-4

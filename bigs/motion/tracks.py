@@ -33,7 +33,7 @@ def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence
     first = np.concatenate([[0], np.cumsum(counts)]).tolist()
     frame = np.repeat(np.arange(len(counts)), counts)
     root = list(range(first[-1]))
-    # The frames that each root's track has, a bit for each.
+    # The frames of each root's track, one bit per frame.
     shown = [1 << t for t in frame.tolist()]
 
     def find(i: int) -> int:

@@ -30,34 +30,34 @@ from bigs.types import Side
 class AlignConfig:
     """The search and what it minimises, in metres."""
 
-    # Sizes tried: factors on the first guess, evenly spaced in their logarithm; then as many steps between
+    # Sizes to try: factors on the first guess, evenly spaced in their logarithm; then as many steps between
     # the neighbours of the best.
     span: float = 0.3
     sizes: int = 13
     finer: int = 7
-    # Cost, in touching frames, of a size that is off the first guess by a share of `size_sigma`; grows with
-    # the square. It decides where contact tells nothing.
+    # Cost, in touching frames, of a size that differs from the first guess by a share of `size_sigma`; grows
+    # with the square. It decides where contact tells nothing.
     size_prior: float = 0.02
     size_sigma: float = 0.05
-    # Shifts along the ray tried in every frame, as a share of the hand's depth.
+    # Shifts along the ray to try in every frame, as a share of the hand's depth.
     reach: float = 0.1
     shifts: int = 41
-    # A hand that touches in the image has this many vertices near the surface; distances saturate here.
+    # A hand that touches in the image has this many vertices near the surface; distances saturate at this.
     nearest: int = 30
     saturation: float = 0.01
     # Vertices deeper than `depth` count with this weight.
     penetration: float = 2.0
     depth: float = 0.003
-    # Weights of a shift's square in units of `shift_sigma`, and of its change from frame to frame in units
-    # of `change_sigma`, both shares of the depth. Beyond about `shift_outlier` sigmas a shift costs little
-    # more, but where hands are where they should be, contact is no reason to move them.
+    # Weights of a shift's square in units of `shift_sigma`, and of its change between frames in units of
+    # `change_sigma`, both shares of the depth. Beyond about `shift_outlier` sigmas a shift costs little more.
+    # Where hands are where they should be, contact is no reason to move them.
     shift_sigma: float = USUAL_DEPTH_SIGMA
     shift_outlier: float = 3.0
     change_sigma: float = 0.005
     prior: float = 0.1
     # Mask pixels of hand and object that are this near each other touch.
     touch_pixels: int = 3
-    # Vertices that are looked at: every so many.
+    # Use every Nth vertex.
     every: int = 2
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
 
@@ -66,7 +66,7 @@ class AlignReport(NamedTuple):
     """How the size was found."""
 
     touching: dict[Side, np.ndarray]  # [T] bool: masks of hand and object meet
-    factors: np.ndarray  # [C] sizes tried, as factors on the first guess
+    factors: np.ndarray  # [C] sizes, as factors on the first guess
     costs: np.ndarray  # [C] mean cost of a touching frame at the best shifts
     shifts: dict[Side, np.ndarray]  # [T] metres along the ray
     notes: tuple[str, ...]

@@ -40,7 +40,7 @@ HANDS_FILE = "hands.npz"
 SFM_FILE = "object_sfm.npz"
 ALIGNED_FILE = "aligned.npz"
 
-# No picture has more on a side.
+# No picture has more pixels on a side.
 _MOST_PIXELS = 1 << 16
 
 State = Literal["missing", "current", "outdated", "supplied"]
@@ -50,16 +50,16 @@ State = Literal["missing", "current", "outdated", "supplied"]
 class FrameSet:
     """What `frames.json` says of the images in `frames/`."""
 
-    names: tuple[str, ...]  # T original names: files, or the video's with the number of the frame in it
+    names: tuple[str, ...]  # T original names: those of files, or the video's with the frame number
     fps: float  # of the frames that were kept
     width: int
     height: int
     K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
-    camera: str  # how K was found, for people
-    focal_known: bool  # K comes from a measurement, not from an assumption that may be refined
-    source_frames: tuple[int, ...] = ()  # T places among the source's frames; () for one after the other
-    source_length: int = 0  # how many frames the source has; 0 for T
-    source_size: tuple[int, int] = (0, 0)  # width, height before shrinking; (0, 0) for those of the frames
+    camera: str  # how K was found, in words
+    focal_known: bool  # K was measured; otherwise it is an assumption that may be refined
+    source_frames: tuple[int, ...] = ()  # T numbers among the source's frames; () if consecutive
+    source_length: int = 0  # number of frames of the source; 0 for T
+    source_size: tuple[int, int] = (0, 0)  # width, height before shrinking; (0, 0) for the frames' own
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ObjectSfm:
     rotations: np.ndarray  # [T, 3, 3] object to camera
     transl: np.ndarray  # [T, 3]
     valid: np.ndarray  # [T] bool: registered; the others are interpolated
-    confidence: np.ndarray  # [T] in [0, 1]; 0 where a pose is not to be trusted at all
+    confidence: np.ndarray  # [T] in [0, 1]; 0 for a pose that is not to be trusted
     points: np.ndarray  # [N, 3] trimmed points, before normalisation
     colors: np.ndarray  # [N, 3] uint8
     norm_mat: np.ndarray  # [4, 4]: carries `points` to the centred cloud of unit radius, HOLD's pts.cano
@@ -120,7 +120,7 @@ def state_of(path: Path, inputs: str) -> State:
     stored = _read_json(path) if path.suffix == ".json" else _read_npz(path, ("version", "inputs"))
     if not str(stored.get("inputs", "")):
         return "supplied"
-    # As text, for whatever may stand there.
+    # As text, whatever the value is.
     current = str(stored.get("version")) == str(VERSION) and str(stored["inputs"]) == inputs
     return "current" if current else "outdated"
 
@@ -197,7 +197,7 @@ def mask_paths(processed: Path, frames: FrameSet) -> list[Path]:
     return _numbered(processed / MASKS, len(frames.names))
 
 
-# How far a hand's depth is usually off, as a share of it, where an estimator does not say (HaMeR's kind).
+# Usual relative error of a hand's depth if the estimator does not state it (as for HaMeR).
 USUAL_DEPTH_SIGMA = 0.04
 
 

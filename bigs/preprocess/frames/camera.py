@@ -15,11 +15,12 @@ from bigs.data.colmap_files import check_model_files
 from bigs.data.fields import LARGEST, array_field
 from bigs.preprocess.frames.source import Source
 
-# Without any knowledge the focal length is taken to be this many times the longer side (46 degrees across).
+# Without any information the focal length is assumed to be this many times the longer side (46 degrees
+# across).
 ASSUMED_FOCAL = 1.2
-# The diagonal of a 35 mm picture, to which cameras refer their "35 mm equivalent" focal length, millimetres.
+# Diagonal of a 35 mm picture, to which "35 mm equivalent" focal lengths refer, millimetres.
 _FULL_FRAME_DIAGONAL = 43.27
-# Names of EXIF's and QuickTime's entries.
+# Names of the entries in EXIF and QuickTime.
 _EXIF_FOCAL_35MM = 0xA405
 _QUICKTIME_FOCAL_35MM = "focal_length.35mm_equivalent"
 
@@ -29,8 +30,8 @@ class Camera:
     """Intrinsics at the source's own size."""
 
     K: np.ndarray  # [3, 3]; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)
-    found: str  # how, for people
-    known: bool  # not an assumption
+    found: str  # how it was found, in words
+    known: bool  # whether it is more than an assumption
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     check_model_files(folder)
     try:
         cameras = pycolmap.Reconstruction(str(folder)).cameras
-    except Exception as error:  # pycolmap raises what its C++ throws
+    except Exception as error:  # pycolmap raises its C++ exceptions
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
             f"{folder}: expected a COLMAP model (cameras, images, points3D), found {reason}"

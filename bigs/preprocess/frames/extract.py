@@ -16,7 +16,7 @@ from bigs.preprocess.artefacts import FRAMES, FRAMES_FILE, FrameSet, content_dig
 from bigs.preprocess.frames.camera import CameraRequest, find_camera, scale_camera
 from bigs.preprocess.frames.source import Source
 
-# Sharpness is compared on pictures of about this width: finer grain is noise.
+# Sharpness is compared on pictures of about this width, since finer grain is noise.
 _COMPARED_WIDTH = 480
 _FEWEST = 4
 
@@ -25,10 +25,10 @@ _FEWEST = 4
 class FrameConfig:
     """Which pictures become frames."""
 
-    stride: int = 1  # one frame of so many pictures
-    sharpest: bool = False  # of each stride the sharpest, not the first
-    start: int = 0  # the first picture that counts
-    count: int = 0  # at most so many frames; 0 for all
+    stride: int = 1  # keep every Nth picture
+    sharpest: bool = False  # keep the sharpest picture of each stride, not the first
+    start: int = 0  # number of the first picture to use
+    count: int = 0  # most frames to keep; 0 keeps all
     max_size: int = 1280  # longer side in pixels to which larger frames are shrunk; 0 for none
     camera: CameraRequest = field(default_factory=CameraRequest)
 
@@ -70,7 +70,7 @@ def extract_frames(
     config.check()
     folder = processed / FRAMES
     folder.mkdir(parents=True, exist_ok=True)
-    # Until the new list is written there is none: images and list never disagree.
+    # There is no list until the new one is written, so images and list never disagree.
     (processed / FRAMES_FILE).unlink(missing_ok=True)
     size: tuple[int, int] | None = None
     names: list[str] = []
@@ -85,7 +85,7 @@ def extract_frames(
                 f"found {found[0]} x {found[1]}"
             )
         with atomic_write(folder / f"{len(names):04d}.png") as file:
-            # The fastest level: these files are read a few times and never shipped.
+            # The fastest compression: these files are read a few times and never shipped.
             Image.fromarray(_shrunk(pixels, config.max_size)).save(file, "PNG", compress_level=1)
         names.append(name)
         indices.append(index)

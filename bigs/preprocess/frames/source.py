@@ -18,7 +18,7 @@ from bigs.files import open_regular
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-# FFmpeg's names of these kinds, and how they begin.
+# FFmpeg's names of these containers, and their first bytes.
 _CONTAINERS = {
     "mov": re.compile(rb".{4}(?:ftyp|moov|mdat|wide|free|skip|pnot)", re.DOTALL),
     "matroska": re.compile(rb"\x1a\x45\xdf\xa3"),
@@ -28,11 +28,11 @@ _CONTAINERS = {
     "mpegvideo": re.compile(rb"\x00\x00\x01\xb3"),
 }
 _HEAD_BYTES = 16
-# A film that names others as its tracks would have them opened.
+# A film that refers to other files would have them opened.
 _OPTIONS = {"mov": {"enable_drefs": "0", "use_absolute_path": "0"}}
-# An hour at 240 frames a second; a clip has hundreds.
+# An hour at 240 frames per second; a clip has hundreds of frames.
 _MAX_FRAMES = 864_000
-# Folders of images say nothing of time.
+# Frame rate of a folder of images, which does not state one.
 FOLDER_FPS = 30.0
 
 
@@ -72,7 +72,7 @@ class Source:
                     if index >= _MAX_FRAMES:
                         raise InputError(f"{self.path}: expected at most {_MAX_FRAMES} frames, found more")
                     pixels = frame.to_ndarray(format="rgb24")
-                    # The flag says how far to turn the picture counter-clockwise to set it upright.
+                    # The flag is the counter-clockwise rotation that sets the picture upright.
                     yield (
                         f"{index:06d}.png",
                         np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90))),

@@ -32,7 +32,7 @@ _CROP, _CROP_FOCAL = 256.0, 5000.0
 class ParameterDump:
     """One hand's MANO parameters; invalid frames hold anything finite."""
 
-    rotations: np.ndarray  # [T, 16, 3, 3] wrist and full finger rotations (no mean pose to be added)
+    rotations: np.ndarray  # [T, 16, 3, 3] wrist and full finger rotations (without a mean pose to add)
     betas: np.ndarray  # [T, 10]
     transl: np.ndarray  # [T, 3] metres, camera frame, for the focal length `K`
     valid: np.ndarray  # [T] bool
@@ -217,7 +217,7 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
     mirror = np.array([-1.0, 1.0, 1.0])
     if "pred_cam" in stored:
         cam = field("pred_cam", (3,))
-        # A left crop was mirrored: its shift is to the other side of the picture's.
+        # A left crop is mirrored, so its shift points to the other side of the picture.
         cam[~right, 1] *= -1.0
         transl = full_image_translation(
             cam, field("box_center", (2,)), field("box_size", (1,))[:, 0], width, height
@@ -229,7 +229,7 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
         focal = number_field(where, require(where, stored, "scaled_focal_length"))
         K = hamer_camera(width, height)
         K[0, 0] = K[1, 1] = focal
-    # HaMeR's own output is the right hand of the mirrored crop; some wrappers turn it back already.
+    # HaMeR's own output is the right hand of the mirrored crop; some wrappers mirror it back.
     mirrored = flat_field(f"{file}: mirrored", stored.get("mirrored", "pred_cam" in stored))
     if mirrored.all():
         turns[~right] = turns[~right] * mirror[:, None] * mirror
@@ -267,7 +267,7 @@ def _matrices(turns: np.ndarray) -> np.ndarray:
 def _detection_frames(file: Path, stored: Mapping[str, Any], count: int, frames: FrameSet) -> np.ndarray:
     """The frame [N] of each detection, -1 for one of a picture that was not kept."""
     named = require(f"{file}: frame", stored, "frame")
-    # A list of texts stays one: an array would make each as long as the longest.
+    # A list of texts stays a list: an array would pad each to the longest.
     listed = named if isinstance(named, list | tuple) else np.ravel(named).tolist()
     if len(listed) != count:
         raise InputError(f"{file}: frame: expected one for each of {count} detections, found {len(listed)}")

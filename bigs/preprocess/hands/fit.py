@@ -22,9 +22,9 @@ from bigs.preprocess.hands.skeleton import HandPoses, HandSkeleton
 class HandFitConfig:
     """How keypoints become poses. Lengths in metres, angles in radians, times in frames at 30 a second."""
 
-    # Keypoints err by this share of the hand's size in the image (3 pixels for a hand of 120).
+    # Error of keypoints as a share of the hand's size in the image (3 pixels for a hand of 120).
     noise: float = 0.025
-    # Geman and McClure's scale, in standard deviations of that noise.
+    # Scale of the Geman-McClure function, in standard deviations of that noise.
     outlier: float = 3.0
     candidates: int = 6
     candidate_steps: int = 50
@@ -34,15 +34,15 @@ class HandFitConfig:
     # Typical second differences over time of joints (of a hand of mean size) and of finger angles.
     joint_acceleration: float = 0.003
     angle_acceleration: float = 0.08
-    # Errors of the poses are alike in all frames, so many frames say little more of the shape than few: the
-    # pull to the mean shape counts so many times.
+    # Pose errors are alike in all frames, so many frames say little more about the shape than few: the pull
+    # to the mean shape counts this many times.
     shape_weight: float = 10.0
-    # How far joints move from frame to frame, which chooses among candidates.
+    # Typical motion of joints between frames, which selects among candidates.
     reach: float = 0.008
-    # A frame with fewer keypoints, or fewer that are explained, is marked as having no estimate.
+    # A frame with fewer keypoints, or fewer explained ones, is marked as having no estimate.
     joints_needed: int = 8
-    # By what share of it depth is off from frame to frame and between the hands; an error of the shared size
-    # is no error between hands and object.
+    # Relative error of depth between frames and between the hands; an error of the shared size is no error
+    # between hands and object.
     depth_sigma: float = 0.01
 
 
@@ -51,7 +51,7 @@ class HandFit(NamedTuple):
 
     poses: HandPoses  # leading axes [H, T]
     betas: Tensor  # [10]
-    explained: Tensor  # [H, T] how many joints lie near their keypoints
+    explained: Tensor  # [H, T] number of joints near their keypoints
 
 
 def fit_rays(
@@ -99,7 +99,7 @@ def _start(
     guesses = guess_poses(skeleton, rays[frames], trust[frames], config.candidates)
     poses, energy = _improve(skeleton, guesses, rays[frames], trust[frames], sigma, config)
     for _ in range(config.exchanges):
-        # A frame whose own guesses are all wrong gets the right one from a neighbour.
+        # A frame whose own guesses are all wrong gets a right one from a neighbour.
         offered = _with_neighbours(poses, energy)
         poses, energy = _improve(skeleton, offered, rays[frames], trust[frames], sigma, config)
         poses, energy = _best_distinct(skeleton, poses, energy, config.candidates)
@@ -166,7 +166,7 @@ def _best_distinct(
     for _ in range(count):
         best = left.argmin(dim=1)
         chosen.append(best)
-        # Doubles come last, not never: there may be no more than one kind.
+        # Duplicates come last instead of never, since there may be only one kind.
         left = left + 1e3 * (apart[rows, best] < 0.01)
     order = torch.stack(chosen, dim=1)
     pick = lambda part: part[rows[:, None], order]  # noqa: E731
@@ -198,7 +198,7 @@ def _refine(
         loss = loss + 0.5 * skeleton.unlikeliness(poses.angles).sum()
         loss = loss + 0.5 * config.shape_weight * betas.square().sum()
         if frames > 2:
-            # In units of the hand's own size, or else a small hand near the camera would seem the smoother.
+            # In units of the hand's own size; otherwise a small hand near the camera would seem smoother.
             step = config.joint_acceleration * pace**2 * skeleton.size(betas) / usual_size
             joint = second_differences(by_hand(joints)) / step
             angle = second_differences(by_hand(poses.angles)) / (config.angle_acceleration * pace**2)

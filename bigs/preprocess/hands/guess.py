@@ -15,10 +15,10 @@ from torch import Tensor
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.preprocess.hands.skeleton import HandPoses, HandSkeleton
 
-# How far fingers are bent in the hands that are tried, as shares of their range towards the palm.
+# Bends of the fingers to try, as shares of their range towards the palm.
 _BENDS = (0.05, 0.3, 0.55, 0.8)
 _VIEWS = 96
-# Candidates of a frame differ by at least this angle or by how far the fingers are bent, radians.
+# Candidates of a frame differ by at least this angle or this bend of the fingers, radians.
 _APART = 0.45
 
 
@@ -62,7 +62,7 @@ def guess_poses(skeleton: HandSkeleton, rays: Tensor, trust: Tensor, count: int)
     depth = 1.0 / a.abs().clamp_min(1e-6)
     spin = _about_z(a.angle())
     orient = spin @ views[chosen % _VIEWS]
-    # b is where the model's origin is seen; the wrist lies off it.
+    # b is the image of the model's origin; the wrist lies beside it.
     anchor = torch.einsum("bkij,bkj->bki", orient, shapes[chosen // _VIEWS][:, :, 0])
     wrist = torch.stack([b.real * depth, b.imag * depth, depth], dim=-1) + anchor
     return HandPoses(bent[chosen // _VIEWS], orient, wrist)
@@ -86,8 +86,8 @@ def likeliest_sequence(joints: Tensor, energy: Tensor, times: Tensor, reach: flo
     for t in range(1, len(joints)):
         step = (shape[t - 1][:, None] - shape[t][None]).square().sum(-1).mean(-1)
         steps = step / (reach * float(times[t] - times[t - 1])) ** 2
-        # The joints of a hand move together, so a step counts as that of two points or so. Bounded, because a
-        # wrong frame should cost no more than being wrong.
+        # The joints of a hand move together, so a step counts like that of about two points. It is bounded,
+        # because a wrong frame should cost no more than being wrong.
         cost = 3.0 * steps / (1.0 + steps / 10.0)
         both = total[:, None] + cost
         total, source = both.min(dim=0)

@@ -71,7 +71,7 @@ def _from_parameters(side: Side, dump: ParameterDump, hand_models: Mapping[Side,
     model = hand_models[side]
     turns = Rotation.from_matrix(dump.rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 16, 3)
     betas = np.median(dump.betas[dump.valid], axis=0)
-    # Every frame had a shape of its own; the wrist stays where that put it.
+    # Each frame had its own shape; the wrist stays where that put it.
     own = torch.as_tensor(dump.betas, dtype=torch.float32)
     with torch.no_grad():
         shared = model.rest_joints(torch.as_tensor(betas, dtype=torch.float32))[0]

@@ -28,7 +28,7 @@ from bigs.preprocess.frames.matching import match_count, match_names
 from bigs.types import SIDES, Side
 
 JOINTS = 21
-# Where each of MANO's joints and the tips stand in the order that begins with the thumb.
+# Positions of MANO's joints and the tips in the order that begins with the thumb.
 _FROM_OPENPOSE = (0, 5, 6, 7, 9, 10, 11, 17, 18, 19, 13, 14, 15, 1, 2, 3, 4, 8, 12, 16, 20)
 ORDERS: dict[str, tuple[int, ...]] = {"openpose": _FROM_OPENPOSE, "mano": tuple(range(JOINTS))}
 

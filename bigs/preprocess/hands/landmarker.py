@@ -17,7 +17,7 @@ from bigs.data.images import read_image
 from bigs.preprocess.hands.keypoints import JOINTS, ORDERS, Keypoints
 from bigs.types import Side
 
-# MediaPipe takes every picture for a mirrored one of a person who looks at himself.
+# MediaPipe assumes mirrored pictures, as of a person who looks at themselves.
 _SIDE_OF: dict[str, Side] = {"Left": "right", "Right": "left"}
 
 

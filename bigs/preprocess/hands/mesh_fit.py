@@ -10,12 +10,12 @@ from bigs.hand import HandModel
 from bigs.preprocess.hands.descent import minimise
 from bigs.preprocess.hands.skeleton import HandPoses, HandSkeleton
 
-# Wrist and knuckles of the fingers move together: they say how the hand is turned.
+# Wrist and knuckles move together, so they give the hand's orientation.
 _PALM = (0, 1, 4, 7, 10)
 _STEPS = 250
 _RATE = 0.03
-# A millimetre counts as one standard deviation, so that the habits of hands decide only what geometry
-# leaves open.
+# A millimetre counts as one standard deviation, so that the pose prior decides only what geometry leaves
+# open.
 _MILLIMETRE = 1e-3
 
 
@@ -38,7 +38,7 @@ def fit_geometry(
     rest = skeleton.joints(torch.zeros(10), skeleton.mean[None], torch.eye(3)[None], torch.zeros(1, 3))[0]
     palm = list(_PALM)
     source, target = rest[palm] - rest[palm].mean(0), joints[:, palm] - joints[:, palm].mean(1, keepdim=True)
-    # Kabsch: the rotation that carries the rest palm nearest to the given one.
+    # Kabsch: the rotation that maps the rest palm closest to the given one.
     orient = project_to_rotation(torch.einsum("tni,nj->tij", target, source))
     turn = torch.zeros(len(joints), 3, requires_grad=True)
     angles = skeleton.mean.repeat(len(joints), 1, 1).requires_grad_()

@@ -10,14 +10,14 @@ import numpy as np
 from bigs.preprocess.hands.keypoints import JOINTS, Keypoints
 from bigs.types import MASK_VALUES, SIDES, Side
 
-# Frames on each side whose median says where a hand should be.
+# Frames on each side whose median predicts where a hand should be.
 _REACH = 5
-# Hands in the same place, as a share of their size, are one hand found twice.
+# Hands this near to each other, as a share of their size, are one hand found twice.
 _SAME = 0.15
 _SAME_JOINTS = 6
-# Swapping must explain a frame better by this much (in hand sizes), so that touching hands are left alone.
+# Swapping must explain a frame better by this much (in hand sizes), so that touching hands stay as they are.
 _MARGIN = 0.15
-# A keypoint this far from everything in the masks, as a share of the hand's size, is a stray one.
+# A keypoint this far from every mask, as a share of the hand's size, is an outlier.
 _STRAY = 0.2
 
 
@@ -46,8 +46,7 @@ def sort_sides(hands: Mapping[Side, Keypoints], masks: Sequence[np.ndarray] | No
     size = _hand_size(points, trust)
     votes = np.zeros((frames, 2, 2)) if masks is None else _mask_votes(points, trust, masks)
     for step in range(10):
-        # cost[t, i, j]: how badly the keypoints listed for side i sit on side j. Masks have the first
-        # word, because a
+        # cost[t, i, j]: how badly the keypoints listed for side i fit side j. Masks come first, because a
         # clip that is swapped throughout agrees with itself.
         cost = -votes
         if step:

@@ -44,7 +44,7 @@ _THUMB_JOINTS = (
     (AngleRange(0.3, 0.3, -0.3, 1.1), AngleRange(0.0, 0.1, -0.2, 0.2), AngleRange(0.0, 0.1, -0.2, 0.2)),
     (AngleRange(0.3, 0.4, -0.4, 1.5), AngleRange(0.0, 0.05, -0.1, 0.1), AngleRange(0.0, 0.05, -0.1, 0.1)),
 )
-# The last two joints of a finger share their tendons: the end one bends by about this share of the other.
+# The last two joints of a finger share tendons: the outer one bends by about this share of the other.
 _TENDON_SHARE, _TENDON_SPREAD = 0.6, 0.25
 
 

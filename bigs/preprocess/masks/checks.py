@@ -11,13 +11,13 @@ from bigs.checks import InputError
 from bigs.preprocess.frames.frame_ranges import frame_ranges
 from bigs.types import ENTITIES, MASK_VALUES
 
-# An area that differs from the median of the frames around by this factor flickers.
+# An area that differs by this factor from the median of the frames around it flickers.
 _JUMP = 1.8
 _AROUND = 3
-# A mask in more pieces than a hand cut by fingers has is torn.
+# A mask in more pieces than a hand cut by fingers is torn.
 _PIECES = 6
 _CRUMB = 0.002  # pieces below this share of the entity's area are specks, not pieces
-# Pixels claimed by two entities, as a share of all that are claimed.
+# Share of the masks' pixels that two entities claim.
 _TWICE = 0.02
 
 

@@ -23,7 +23,7 @@ from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.hands.keypoints import Keypoints, frame_pixels
 from bigs.types import ENTITIES, MASK_VALUES, Entity, Side
 
-# A hand's box goes this far beyond its joints, as a share of its size: flesh lies around bones.
+# A hand's box extends this far beyond its joints, as a share of its size, to include flesh.
 _BEYOND = 0.12
 # Wrist and knuckles lie well inside a hand.
 _INSIDE = (0, 1, 4, 7, 10)

@@ -28,9 +28,9 @@ _FOLDER_NAMES: dict[Entity, tuple[str, ...]] = {
     "left": ("left", "left_hand", "hand_left"),
     "object": ("object", "obj"),
 }
-# An image of one entity counts where it is brighter than this; lossy files have no clean values.
+# A mask of one entity counts where it is brighter than this, since lossy files have no clean values.
 _BRIGHT = 100
-# Who is on top where folders of entities overlap, last: HOLD's order.
+# Order in which overlapping masks are painted, the last on top: HOLD's order.
 _PAINTED: tuple[Entity, ...] = ("right", "left", "object")
 
 

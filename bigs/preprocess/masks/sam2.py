@@ -21,10 +21,10 @@ from bigs.data.images import read_image
 from bigs.preprocess.masks.clicks import Click
 from bigs.types import MASK_VALUES, Entity
 
-# ImageNet's, with which the model was trained.
+# ImageNet's statistics, with which the model was trained.
 _MEAN = torch.tensor([0.485, 0.456, 0.406])
 _STD = torch.tensor([0.229, 0.224, 0.225])
-# The prompt encoder's labels: a point beside the thing, one on it, and the two corners of a box.
+# The prompt encoder's labels: a point beside the thing, a point on it, and the two corners of a box.
 _BESIDE, _ON, _CORNERS = 0, 1, (2, 3)
 
 
@@ -59,7 +59,7 @@ def load_sam2(folder: Path) -> Any:
         raise InputError(f"{folder}: expected a SAM 2 video model, found {reason}") from None
     model, told = loaded
     if told["missing_keys"]:
-        # The library would go on with random numbers in their place.
+        # The library would continue with random numbers in their place.
         raise InputError(
             f"{folder}: expected all weights of a SAM 2 video model, found none for "
             f"{len(told['missing_keys'])} of its parts ({min(told['missing_keys'])}, ...)"
@@ -95,7 +95,7 @@ def segment_clip(
         T label images [H, W] uint8; where several things claim a pixel, the surest one has it.
     """
     scores: dict[Entity, list[Tensor]] = {}
-    # Things clicked in the same frames share the work on each picture.
+    # Things clicked in the same frames share the encoding of each picture.
     groups: dict[tuple[int, ...], list[Entity]] = {}
     for entity, prompts in clicks.items():
         groups.setdefault(tuple(sorted({click.frame for click in prompts})), []).append(entity)
@@ -124,7 +124,7 @@ def _follow(
 
     side = int(model.image_size)
     session = Sam2VideoInferenceSession(video_height=size[1], video_width=size[0], dtype=torch.float32)
-    # Frames are decoded when they are asked for: a minute of video at this size would fill the memory.
+    # Frames are decoded on demand: a minute of video at this size would fill the memory.
     session.processed_frames = _LazyFrames(images, side)
     ids = {entity: MASK_VALUES[entity] for entity in clicks}
     for entity, prompts in clicks.items():

@@ -26,32 +26,32 @@ from bigs.motion.tracks import Tracks
 class CheckConfig:
     """When a frame is flagged."""
 
-    # Fewer sightings than this do not make a pose; the motion does.
+    # With fewer observations, the pose is the motion prior's.
     least_sightings: int = 8
-    # A standard deviation of the rotation that the observations alone leave open, degrees.
+    # Standard deviation of the rotation from the observations alone, degrees.
     most_uncertain: float = 1.0
     # Cosine between the mean angular velocities of the five frames before and after.
     least_cosine: float = 0.8
-    # A step that is longer than this many usual ones, and than this angle, degrees.
+    # A step longer than this many usual ones, and than this angle, degrees.
     long_step: float = 2.0
     least_long_step: float = 8.0
-    # Standard deviations by which a segment must fit better than its mirror image in depth. Right ones had
-    # 3.5 and more where little was seen, reversed ones 0 and less, and bent ones 1 to 2.
+    # Standard deviations by which a segment must fit better than its mirror image in depth. Right ones had at
+    # least 3.5 where little was seen, reversed ones at most 0, and bent ones 1 to 2.
     least_evidence: float = 2.5
-    # A partial model's turns that differ from the map's by more than this, degrees.
+    # Difference between a partial model's rotations and the map's, degrees.
     most_disagreement: float = 5.0
-    # Frames that are compared with their mirror image together, half of them with the next ones too.
+    # Frames that are compared with their mirror image together; windows overlap by half.
     mirror_window: int = 20
 
 
 class SfmChecks(NamedTuple):
     """What was found in each frame."""
 
-    sightings: np.ndarray  # [T] believed sightings of points
-    uncertainty: np.ndarray  # [T] degrees against the frame that most others are tied to
-    mirror: np.ndarray  # [T] evidence against the mirror image, the worst window's; below 0 is wrong
-    cosine: np.ndarray  # [T] of angular velocity before and after; 1 where nothing turns
-    flags: list[list[str]]  # T lists of plain words; empty where nothing is wrong
+    sightings: np.ndarray  # [T] number of accepted observations
+    uncertainty: np.ndarray  # [T] degrees relative to the best connected frame
+    mirror: np.ndarray  # [T] evidence against the mirror image in the worst window; below 0 is wrong
+    cosine: np.ndarray  # [T] cosine of angular velocities before and after; 1 where nothing turns
+    flags: list[list[str]]  # T lists of plain words; empty if nothing is wrong
 
     def doubtful(self) -> np.ndarray:
         """Frames [T] (bool) whose pose should not be relied on."""
@@ -64,7 +64,7 @@ REVERSED = "depth may be reversed"
 TURN = "turn changes"
 STEP = "long step"
 OTHERWISE = "models disagree"
-# A turn that changes may be real; the others are not.
+# A change of rotation may be real; the others are not.
 _SERIOUS = {FEW, LOOSE, REVERSED, STEP, OTHERWISE}
 
 
@@ -79,10 +79,10 @@ def check_map(
     frames = len(map_.posed)
     sightings = np.bincount(map_.frame[map_.use()], minlength=frames)
     bundle, _ = map_.bundle(np.arange(frames))
-    # The prior is all but lifted: what counts is what the observations say.
+    # The prior is nearly removed, so the observations count.
     loose = replace(map_.config.bundle, turn_sigma=3.0, shift_sigma=0.015)
     between = turn_uncertainties(bundle, map_.K, loose)
-    # Of two parts that hang together loosely the larger one is believed.
+    # Of two loosely connected parts the larger one is believed.
     tied = (between <= config.most_uncertain).sum(1)
     uncertainty = between[max(range(frames), key=lambda t: (tied[t], sightings[t]))]
     trial = ObjectMap(features, tracks, map_.K, MapConfig())
@@ -96,8 +96,8 @@ def check_map(
     otherwise = np.zeros(frames, dtype=bool)
     for part in smooth_parts(models):
         degrees = disagreement(map_.rotations, part)
-        # A model that is the map's mirror image in depth is one more start that came out reversed: which of
-        # the two is right, perspective tells.
+        # A model that is the map's mirror image in depth is another start that came out reversed; perspective
+        # decides between the two.
         image = part._replace(rotations=mirrored(part.rotations))
         if min(degrees.max(), disagreement(map_.rotations, image).max()) <= config.most_disagreement:
             continue
@@ -142,7 +142,7 @@ def _outdone(map_: ObjectMap, trial: ObjectMap, part: PartialModel, config: Chec
     rotations, transl = joined(map_, part, rows)
     better, ours, theirs = evidence(trial, part.frames, poses, (rotations[part.frames], transl[part.frames]))
     off = [disagreement(map_.rotations, part._replace(rotations=turned)).max() for turned in (ours, theirs)]
-    # If the part, too, comes to what the map says, there is nothing to choose.
+    # If the part converges to the map as well, there is nothing to choose.
     one = off[1] <= config.most_disagreement
     return off[0] <= config.most_disagreement and (one or better >= config.least_evidence)
 

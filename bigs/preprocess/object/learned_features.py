@@ -98,7 +98,7 @@ def _extract(
     column, row = np.floor(pixels).astype(int).T
     inside = mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
     count = int(inside.sum())
-    # The search for points asks for descriptors of SIFT's length.
+    # The search for points expects descriptors of SIFT's length.
     descriptors = torch.nn.functional.normalize(found.descriptors, dim=-1).numpy() * 512.0
     return FrameFeatures(
         pixels[inside], np.full(count, 1.0 / factor[0]), np.zeros(count), descriptors[inside]

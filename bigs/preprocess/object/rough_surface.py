@@ -23,11 +23,11 @@ class SurfaceConfig:
     """Lengths in metres."""
 
     resolution: int = 48  # cells along the longest side
-    frames: int = 24  # silhouettes that carve, spread over the clip
-    agreeing: int = 3  # of them must agree before a place is carved away
-    reach: float = 0.016  # at this distance from the nearest point the hull alone decides
+    frames: int = 24  # number of silhouettes that carve, spread over the clip
+    agreeing: int = 3  # number of them that must agree before a place is carved away
+    reach: float = 0.016  # distance from the nearest point at which the hull alone decides
     margin: float = 0.01  # how far the surface may leave the points' convex hull
-    possible: float = 0.001  # a hand counts as this far off where object is possible but not known
+    possible: float = 0.001  # distance that a hand counts as off where object is possible but not known
 
 
 def visual_hull(
@@ -62,10 +62,10 @@ def visual_hull(
 class RoughSurface(NamedTuple):
     """Signed distances to the object, where it is known and where it is not."""
 
-    solid: DistanceGrid  # what a hand cannot be in
-    # What a hand touches. Between the solid and the visual hull, where a hand hid the background in every
-    # frame, there may be object (a grip, say) or not: `SurfaceConfig.possible`, so that what is known counts
-    # for more.
+    solid: DistanceGrid  # surface that a hand cannot be inside
+    # Surface that a hand touches. Between the solid and the visual hull, where a hand hid the background in
+    # every frame, there may be object, such as a grip: `SurfaceConfig.possible`, so that known surface counts
+    # more.
     outer: DistanceGrid
 
 

@@ -38,12 +38,12 @@ class SfmConfig:
     refine: RefineConfig = field(default_factory=RefineConfig)
     patches: PatchConfig = field(default_factory=PatchConfig)
     checks: CheckConfig = field(default_factory=CheckConfig)
-    # How many partial models are tried as the start before the best outcome is taken.
+    # Number of partial models that are tried as the start.
     seeds: int = 3
-    # The largest model is the surest start: another's outcome must have less than this share of its misfit.
+    # The largest model is the safest start: another's result must have less than this share of its misfit.
     clearly_better: float = 0.97
-    # If the largest model has less than this share of the frames and nothing sure comes of any, what was
-    # followed is mapped, too.
+    # If the largest model has less than this share of the frames and no result is certain, followed features
+    # are mapped too.
     large_share: float = 0.33
 
 
@@ -52,10 +52,10 @@ class SfmReport(NamedTuple):
 
     features: np.ndarray  # [T] features on the object
     neighbour_matches: np.ndarray  # [T] verified matches with the next frame; 0 for the last
-    models: list[list[int]]  # frames of each partial model, the one that was started from first
-    model: np.ndarray  # [T] which of `models` had the frame; -1 for none
+    models: list[list[int]]  # frames of each partial model, the start first
+    model: np.ndarray  # [T] index of the model that had the frame; -1 for none
     checks: SfmChecks
-    focal: float  # pixels; estimated unless it was known
+    focal: float  # pixels; estimated unless known
     tried: int  # partial models that were tried as the start
 
     def sentences(self) -> list[str]:
@@ -126,7 +126,7 @@ def structure_from_motion(
         candidates = match_learned(features, frame_pairs(len(features), config.mapping), size, matcher)
     mapping = map_features(features, K, size, known_focal, config.mapping, candidates)
     if not mapping.models:
-        # Loosened thresholds will do, since whatever comes of a model is checked.
+        # Loose thresholds suffice, since every model is checked.
         mapping = map_features(features, K, size, known_focal, config.mapping.loosened(), candidates)
     followed, matches = follow(features, mapping.matches, images[clip], object_masks, config.follow)
     tracks = join_matches(matches, [len(frame.pixels) for frame in followed])
@@ -148,7 +148,7 @@ def structure_from_motion(
     return _result(attempt.map, report, images[clip], first, config), report
 
 
-# Fewer frames than this say nothing about depth.
+# Fewer frames say nothing about depth.
 _FEWEST_FRAMES = 5
 
 
@@ -156,9 +156,9 @@ class _Attempt(NamedTuple):
     map: ObjectMap
     seed: Seed
     mapping: Mapping
-    model: int  # which of its models was the start
+    model: int  # index of the model that was the start
     checks: SfmChecks
-    misfit: float  # before points were sought that were never matched
+    misfit: float  # before the search for points that were never matched
 
 
 def _with_focal(K: np.ndarray, focal: float) -> np.ndarray:
@@ -265,7 +265,7 @@ def _result(
     colors = color_points(map_, tracks, images)
     keep = trim_points(map_.points[tracks])
     points = map_.points[tracks[keep]]
-    # Beyond the first and the last frame that shows the object, its pose is that of the nearest one.
+    # Before the first and after the last frame that shows the object, the nearest pose is used.
     place = np.clip(np.arange(len(report.model)) - first, 0, len(map_.posed) - 1)
     checks, least = report.checks, config.checks.least_sightings
     many = checks.sightings / (checks.sightings + 4.0 * least)

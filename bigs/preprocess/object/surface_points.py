@@ -28,18 +28,17 @@ class SurfacePointsConfig:
     surface: SurfaceConfig = field(
         default_factory=lambda: SurfaceConfig(resolution=72, frames=60, margin=0.006)
     )
-    # A point of structure from motion that lies further than this outside the silhouettes is a stray.
+    # A point of structure from motion further than this outside the silhouettes is an outlier.
     outside: float = 0.004
-    # The surface gets points where there are none within this distance, ...
+    # The surface gets points where there is none within this distance, ...
     gap: float = 0.004
-    # ... as far apart as this many usual distances of the others from their neighbours (if they were much
-    # sparser they would pass for strays), ...
+    # ... spaced by this many usual distances of the others (much sparser ones would count as outliers), ...
     sparser: float = 1.2
     # ... where a silhouette passes within this distance and it shows in this many frames, or where it shows
     # in none.
     tight: float = 0.004
     least_seen: int = 2
-    # It may lie this far behind the nearest surface of its pixel.
+    # Largest distance behind the nearest surface of its pixel.
     tolerance: float = 0.004
 
 
@@ -98,7 +97,7 @@ def complete_points(
     )
 
 
-# Fewer points than this carry no surface.
+# Fewer points give no surface.
 _FEWEST_POINTS = 30
 
 
@@ -149,7 +148,7 @@ def _samples(surface: DistanceGrid, spacing: float) -> tuple[np.ndarray, np.ndar
     return np.asarray(samples), np.asarray(mesh.face_normals[face])
 
 
-# Samples of the surface for every square of the spacing.
+# Samples of the surface per square of the spacing.
 _DENSITY = 12.0
 
 
