@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Smallest number of observations of a batch, so that arrays over them stay in the processor's cache.
+# Smallest number of observations of a batch: few enough that arrays over them stay in the cache.
 _BATCH = 8_000
 
 _Numbers = Sequence[np.ndarray] | np.ndarray  # coordinates of a vector or of a row, each [m]
