@@ -110,7 +110,7 @@ NOTHING = FrameFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0,
 
 
 def enlargement(boxes: Sequence[tuple[int, int, int, int] | None], config: FeatureConfig) -> float:
-    """By what all crops are enlarged, so that the largest keeps within bounds."""
+    """The common enlargement of all crops, bounded by the largest crop."""
     largest = max((max(box[1] - box[0], box[3] - box[2]) for box in boxes if box is not None), default=1)
     return min(config.upscale, config.max_side / largest)
 

@@ -61,7 +61,7 @@ class PartialModel(NamedTuple):
 
 
 class Mapping(NamedTuple):
-    """What structure from motion found, and how much it had to go on."""
+    """The models of structure from motion, and the features and matches behind them."""
 
     models: list[PartialModel]  # largest first
     matches: dict[tuple[int, int], np.ndarray]  # (earlier, later frame): [n, 2] verified pairs of features

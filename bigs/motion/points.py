@@ -1,4 +1,4 @@
-"""The object's points after structure from motion: strays left out, coloured, brought to unit size."""
+"""The object's points after structure from motion: without outliers, coloured, at unit size."""
 
 from __future__ import annotations
 

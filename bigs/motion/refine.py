@@ -25,7 +25,7 @@ from bigs.motion.tracks import Tracks
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """How often, and what else is tried."""
+    """The number of rounds, and what is tried in each."""
 
     passes: int = 2
     # Rounds of full bundle adjustment in each pass.

@@ -79,7 +79,7 @@ class GivenPoses(NamedTuple):
 
 
 class TrackedMotion(NamedTuple):
-    """What came of it, in the given object frame."""
+    """The result, in the given object frame."""
 
     rotations: np.ndarray  # [T, 3, 3]
     transl: np.ndarray  # [T, 3]
@@ -99,7 +99,7 @@ def track(
     given: GivenPoses,
     config: TrackerConfig,
 ) -> TrackedMotion:
-    """The object's motion from its pictures and from what was known of it.
+    """The object's motion from its pictures and its given poses.
 
     Args:
         images: T arrays [H, W, 3] uint8.
@@ -124,7 +124,7 @@ def track_matches(
     given: GivenPoses,
     config: TrackerConfig,
 ) -> TrackedMotion:
-    """The same from features and matches that were found before."""
+    """The same from given features and matches."""
     tracks = join_matches(matches, [len(frame.pixels) for frame in features])
     contradicted = contradicted_frames(features, tracks, K, given, config)
     start = _bridged(given, contradicted)

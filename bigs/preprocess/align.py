@@ -63,7 +63,7 @@ class AlignConfig:
 
 
 class AlignReport(NamedTuple):
-    """How the size was found."""
+    """The result of the search for the size."""
 
     touching: dict[Side, np.ndarray]  # [T] bool: masks of hand and object meet
     factors: np.ndarray  # [C] sizes, as factors on the first guess
@@ -194,7 +194,7 @@ def contact_costs(
     factor: float,
     config: AlignConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each shift of a hand along its ray costs in each frame, when the object is `factor` as large.
+    """The cost of each shift of a hand along its ray in each frame, for an object `factor` times as large.
 
     Args:
         verts: [T, V, 3] of the hand, camera frame.

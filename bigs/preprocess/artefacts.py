@@ -1,4 +1,4 @@
-"""What the steps of preprocessing leave for each other below `CLIP/processed`, and whether it is up to date.
+"""The files of preprocessing steps below `CLIP/processed`, and whether they are up to date.
 
 Every artefact names its format's `version` and a digest of its `inputs`. A step whose artefact carries the
 digest that its inputs have now is skipped; one whose inputs changed is done again. An artefact without a
@@ -48,7 +48,7 @@ State = Literal["missing", "current", "outdated", "supplied"]
 
 @dataclass(frozen=True)
 class FrameSet:
-    """What `frames.json` says of the images in `frames/`."""
+    """The content of `frames.json`, about the images in `frames/`."""
 
     names: tuple[str, ...]  # T original names: those of files, or the video's with the frame number
     fps: float  # of the frames that were kept
@@ -90,7 +90,7 @@ class Alignment:
 
 
 def content_digest(*parts: Any) -> str:
-    """A digest of what a step reads.
+    """A digest of a step's inputs.
 
     Args:
         parts: a path stands for its content (a folder for the names and contents of its files, a missing one
@@ -246,7 +246,7 @@ def read_hands(path: Path, frames: int) -> dict[Side, HandTrack]:
 
 
 def read_depth_sigma(path: Path) -> float:
-    """How far the depth of the hands in `hands.npz` is usually off, as a share of it.
+    """The usual relative error of the hands' depth in `hands.npz`.
 
     Raises:
         InputError: missing, damaged, or not a positive number.
@@ -412,7 +412,7 @@ def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.nda
 
 
 def _plain(value: Any) -> Any:
-    """What JSON does not know of, as what it knows."""
+    """Convert what JSON does not know."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 

@@ -1,4 +1,4 @@
-"""Whether a configuration can run at all, told before anything is computed or written."""
+"""Checks whether a configuration can run, before anything is computed or written."""
 
 from __future__ import annotations
 

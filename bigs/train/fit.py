@@ -130,7 +130,7 @@ def fit(
     sources = EvidenceSource(clip, unknown, scene, config, perceptual)
 
     def keep(index: int, state: StageState | None) -> None:
-        """Save what has been reached; of the stage that runs or has just ended."""
+        """Save the state of the running stage, or of the one that has just ended."""
         report.seconds = watch.read()
         if checkpoints:
             save_checkpoint(checkpoints, scene, digest, index, state, asdict(report))
@@ -197,7 +197,7 @@ def _object_motion(
     report: FitReport,
     listen: Listener,
 ) -> TrackedMotion | None:
-    """The stage that comes before the start values, since these are made of what it finds."""
+    """The stage that runs before the start values, since they depend on its result."""
     listen({"event": "stage", "stage": stage.name, "index": 0, "stages": len(config.stages)})
     motion = find_object_motion(clip, config.initial, stage, folder)
     if motion is None:
@@ -209,7 +209,7 @@ def _object_motion(
 
 
 def _split(scene: Scene, stage: SplitStage) -> list[str]:
-    """Free the scene's Gaussians of their fields; says what became of them."""
+    """Free the scene's Gaussians of their fields; returns what to report."""
     notes = []
     if stage.hands:
         for side, hand in scene.hand_splats.items():

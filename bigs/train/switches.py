@@ -1,4 +1,4 @@
-"""Every ingredient of the method under a name by which a configuration can be left without it."""
+"""The ingredients of the method by name, each of which can be left out of a configuration."""
 
 from __future__ import annotations
 

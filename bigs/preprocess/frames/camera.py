@@ -1,4 +1,4 @@
-"""Where K comes from: the user, a COLMAP model, a data set, what the camera wrote, or an assumption."""
+"""Intrinsics from the user, a COLMAP model, a data set, the file's metadata, or an assumption."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class CameraRequest:
-    """What the user says of the camera, at the source's own size; at most one of the three."""
+    """The user's camera options at the source's own size; at most one of the three."""
 
     K: tuple[float, float, float, float] | None = None  # fx, fy, cx, cy pixels
     focal: float | None = None  # pixels

@@ -42,7 +42,7 @@ class FrameConfig:
 
 
 def frame_inputs(source: Source, config: FrameConfig) -> str:
-    """The digest of what `extract_frames` reads."""
+    """The digest of `extract_frames`'s inputs."""
     parts = [source.path] if not source.images else list(source.images)
     cameras = [config.camera.colmap, meta_of_images(source.path)]
     return content_digest(*parts, asdict(config), *(path for path in cameras if path is not None))
@@ -117,7 +117,7 @@ def extract_frames(
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """How sharp a picture [H, W, 3] uint8 is: the variance of the Laplacian of its grey values."""
+    """Sharpness of a picture [H, W, 3] uint8: the variance of the Laplacian of its grey values."""
     step = max(1, pixels.shape[1] // _COMPARED_WIDTH)
     grey = pixels[::step, ::step].astype(np.float32).mean(axis=2)
     inner = grey[1:-1, 1:-1]
@@ -126,7 +126,7 @@ def sharpness(pixels: np.ndarray) -> float:
 
 
 class _Counter:
-    """Counts what passes."""
+    """Counts the items that pass."""
 
     def __init__(self) -> None:
         self.seen = 0

@@ -1,4 +1,4 @@
-"""Which of the things another tool made belongs to which frame: by name, by number, or by order."""
+"""Matching of another tool's files to frames: by name, by number, or by order."""
 
 from __future__ import annotations
 

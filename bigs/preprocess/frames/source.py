@@ -115,7 +115,7 @@ def open_source(path: Path) -> Source:
 
 @contextmanager
 def _open_video(av: Any, path: Path) -> Iterator[Any]:
-    """A video's container, of one of the usual kinds: FFmpeg would follow a playlist to wherever it leads.
+    """Open a video of one of the usual containers, since FFmpeg would follow a playlist anywhere.
 
     Raises:
         InputError: no regular file, or another kind; and what FFmpeg raises.

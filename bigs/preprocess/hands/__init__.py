@@ -1,1 +1,1 @@
-"""Hand tracks: from keypoints by a fit, or from what other estimators leave."""
+"""Hand tracks: fitted to keypoints, or from other estimators' files."""

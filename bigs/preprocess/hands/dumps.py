@@ -1,4 +1,4 @@
-"""What other hand estimators leave, read into one form: HaMeR, HOLD's dumps of it, WiLoR.
+"""Files of other hand estimators in one form: HaMeR, HOLD's dumps of it, WiLoR.
 
 HaMeR and WiLoR predict every hand as a right one in a crop that is mirrored for a left hand, with an
 assumed focal length. Only the depth of the result depends on that: with the true one the hand is moved
@@ -94,7 +94,7 @@ def hamer_camera(width: int, height: int) -> np.ndarray:
 def full_image_translation(
     pred_cam: np.ndarray, box_center: np.ndarray, box_size: np.ndarray, width: int, height: int
 ) -> np.ndarray:
-    """Where a hand of a crop is in the whole picture's camera (HaMeR's `cam_crop_to_full`).
+    """The position of a crop's hand in the whole picture's camera (HaMeR's `cam_crop_to_full`).
 
     Args:
         pred_cam: [N, 3] scale and shift in the crop, not mirrored back.

@@ -252,7 +252,7 @@ def _robust(squares: Tensor, scale: float) -> Tensor:
 
 
 def _misfit(joints: Tensor, target: Tensor, trust: Tensor, sigma: Tensor, outlier: float) -> Tensor:
-    """How badly joints [B, 21, 3] explain keypoints [B, 21, 2]: [B]."""
+    """Misfit [B] of joints [B, 21, 3] to keypoints [B, 21, 2]."""
     error = (_project(joints) - target) / sigma.reshape(-1, 1, 1)
     return (trust * _robust(error.square().sum(-1), outlier)).sum(-1)
 

@@ -1,1 +1,1 @@
-"""Where hands hold the object still, and how large that makes it."""
+"""Grasps: the frames in which hands hold the object, and the object's size that follows."""

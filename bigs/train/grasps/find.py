@@ -1,4 +1,4 @@
-"""Grasps of a scene: where they are, by estimates and pictures, and what frames between them start from."""
+"""Grasps of a scene, found from estimates and pictures, and start values of the frames between them."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _search(
 
 
 def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
-    """The frames that hypotheses are taken from: each grasp, two neighbours as one, and what no grasp has."""
+    """The frames that give hypotheses: each grasp, two neighbours as one, and frames outside grasps."""
     found = list(stretches)
     found += [range(a.start, b.stop) for a, b in pairwise(stretches)]
     edges = [0, *(edge for s in stretches for edge in (s.start, s.stop)), count]
@@ -172,7 +172,7 @@ def _estimate_costs(points: np.ndarray, information: np.ndarray, stretches: list
 
 
 def _place(points: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """The still hand [K, 3] that explains some frames best, whatever a few of them say."""
+    """The still hand [K, 3] that explains some frames best, robustly."""
     place = np.median(points, axis=0)
     for _ in range(3):
         trust = 1.0 / (1.0 + frame_errors(points, information, place))
@@ -261,7 +261,7 @@ def expected_depths(log_depth: Tensor, estimated: Tensor, held: Tensor) -> Tenso
 
 
 def carried_errors(errors: Tensor, known: Tensor, width: float = 10.0, noise: float = 1.0) -> Tensor:
-    """What errors in some frames say about the others: Gaussian-process regression over time.
+    """Errors of other frames predicted from known ones by Gaussian-process regression over time.
 
     Estimators err alike in frames near each other, and to a part in all frames of a clip: the covariance of
     two frames is a constant plus a bell of `width` frames, of equal weight.

@@ -1,4 +1,4 @@
-"""The object's size from contact: at which size do hands that touch it in the image touch it in space?"""
+"""The object's size from contact: hands that touch it in the image must touch it in space."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PIECE = 8
 
 
 class FoundSize(NamedTuple):
-    """What a search came to."""
+    """The result of a search."""
 
     factor: float  # relative to the previous scale
     # Standard error of the factor, from leaving out one grasp after the other; NaN for a single grasp.
@@ -40,7 +40,8 @@ def search_object_scale(
     touching: dict[Side, Tensor],
     occlusion: Callable[[], float] = lambda: 0.0,
 ) -> FoundSize:
-    """Set the object's scale, which leaves its projection alone, to where the hands touch its surface best.
+    """Set the object's scale, which does not change its projection, to where the hands touch its surface
+    best.
 
     The cost is the contact term's own plus `stage.labels_weight` times `occlusion()`: how badly the scene as
     it is agrees with what hides what in the images. Every frame counts by how sure its touch is.
@@ -97,7 +98,7 @@ def _lowest(factors: Tensor, costs: Tensor) -> float:
 
 
 def _pieces(scene: Scene, side: Side, touching: Tensor) -> list[Tensor]:
-    """Frames [T] (bool) that stand or fall together: a grasp's, or a few on end."""
+    """Frames [T] (bool) that form one piece of evidence: those of a grasp, or a few consecutive ones."""
     grasps = scene.grasps[side]
     numbers = grasps.of_frame if grasps.count else torch.arange(len(touching)) // _PIECE
     pieces = [(numbers == g) & (touching > 0) for g in numbers.unique() if g >= 0]
@@ -105,7 +106,7 @@ def _pieces(scene: Scene, side: Side, touching: Tensor) -> list[Tensor]:
 
 
 def _jackknife(without: list[float]) -> float:
-    """The standard error of an estimate from what it is without each of its pieces of evidence."""
+    """The jackknife standard error of an estimate, from leaving out each piece of evidence."""
     count = len(without)
     if count < 2:
         return float("nan")

@@ -30,7 +30,7 @@ class Stretch(NamedTuple):
 
 
 class Prices(NamedTuple):
-    """What a segmentation pays; frames of grasps pay by how badly they fit."""
+    """The prices of a segmentation; frames of grasps pay by their misfit."""
 
     free: float  # price of a frame outside grasps
     grasp: float  # price of each grasp
@@ -164,7 +164,7 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
 
 
 def certainties(costs: np.ndarray, free: float) -> np.ndarray:
-    """How sure it is that a frame belongs to its grasp, from its cost there and outside, both as energies.
+    """Certainty that a frame belongs to its grasp, from its cost there and outside, both as energies.
 
     Args:
         costs: [...] of frames in their grasps.

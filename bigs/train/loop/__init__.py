@@ -1,1 +1,1 @@
-"""Optimisation: what a stage looks at, its steps, loss terms, optimiser, density control and checkpoints."""
+"""Optimisation: a stage's targets, steps, loss terms, optimiser, density control and checkpoints."""

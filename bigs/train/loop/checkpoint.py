@@ -69,7 +69,7 @@ def save_checkpoint(
 
 
 def _checksum(metadata: dict[str, str], tensors: dict[str, Tensor]) -> str:
-    """Tells a file in which bits have changed from a whole one."""
+    """A checksum that reveals changed bits."""
     return checksum(json.dumps(sorted(item for item in metadata.items() if item[0] != "checksum")), tensors)
 
 

@@ -1,4 +1,4 @@
-"""Adaptive density control: which of the object's Gaussians become two, which go, and when.
+"""Adaptive density control: which of the object's Gaussians are split or removed, and when.
 
 As in 3D Gaussian splatting, a Gaussian at whose centre on screen the loss pulls hard is one too few. Here its
 colour, size and place are a field's, so what is added or removed is where that field is evaluated: no moment
@@ -59,7 +59,7 @@ class DensifyConfig:
         return 0 < step < steps and first <= step <= last and (step - first) % every == 0
 
     def watches(self, steps: int, step: int) -> bool:
-        """Whether the step after `step` others counts in what decides the next time."""
+        """Whether the step after `step` others contributes to the next densification."""
         first, last, every = self._times(steps)
         until = first + every * ((min(last, steps - 1) - first) // every)
         return first - every <= step < until
@@ -69,7 +69,7 @@ class DensifyConfig:
 
 
 class Pull(NamedTuple):
-    """What has been gathered of N Gaussians since the last time."""
+    """Statistics of N Gaussians since the last densification."""
 
     total: Tensor  # [N] sum of gradient norms at its centre over the views that showed it
     views: Tensor  # [N] number of these views
@@ -97,7 +97,7 @@ class Pull(NamedTuple):
 
 
 class Fates(NamedTuple):
-    """What becomes of N Gaussians; whoever is in none of these stays."""
+    """What to do with N Gaussians; those in none of the sets stay."""
 
     cloned: Tensor  # [N] bool
     split: Tensor
@@ -133,7 +133,7 @@ def _first(chosen: Tensor, rank: Tensor, room: int) -> Tensor:
 def densified(
     anchors: Anchors, whole: CanonicalObject, pull: Pull, config: DensifyConfig, isotropic: bool = False
 ) -> Anchors:
-    """Where the field is to be evaluated from now on.
+    """Where to evaluate the field from now on.
 
     A clone stands one standard deviation off in the direction that lowers the loss. The two parts of a
     Gaussian that is split lie side by side along its longest axis.

@@ -1,4 +1,4 @@
-"""What each stage looks at: images at its size, touching frames, cheap silhouettes."""
+"""The data of each stage: images at its size, touching frames, cheap silhouettes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Where the time of a run goes: stages, and within a step fields, engine, losses and optimiser.
 
-Only while `profiled` is open are functions replaced by ones that look at the clock; an ordinary run has
-none of it.
+Functions are replaced by timed ones only while `profiled` is open; ordinary runs are not affected.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class StageTimes:
 
     @property
     def rest(self) -> float:
-        """What is in no phase: images read, states kept, checkpoints, logs."""
+        """Time outside all phases: reading images, keeping states, checkpoints, logs."""
         return self.wall - sum(self.phases.values())
 
 
@@ -72,7 +71,7 @@ class Profile:
             self._current.in_steps += event["seconds"]
 
     def begin(self, name: str) -> None:
-        """What follows belongs to stage `name`."""
+        """Begin stage `name`."""
         self.finish()
         self._current = self.stages.setdefault(name, StageTimes())
 

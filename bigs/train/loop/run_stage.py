@@ -1,4 +1,4 @@
-"""One stage of optimisation: the same loop for every stage, which is told apart by data only."""
+"""One stage of optimisation: the same loop for every stage, which differ in data only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bigs.types import Entity
 
 
 class StageProgress(NamedTuple):
-    """What a hook sees after every step."""
+    """The argument of hooks after every step."""
 
     step: int  # steps done
     steps: int  # steps planned
@@ -33,7 +33,7 @@ class StageProgress(NamedTuple):
 
 
 class StageState(NamedTuple):
-    """What has to be kept to continue a stage exactly: steps done, and the optimiser with its moments."""
+    """The state needed to continue a stage exactly: steps done, and the optimiser with its moments."""
 
     step: int
     optimizer: torch.optim.Optimizer
@@ -212,7 +212,7 @@ def _densify(scene: Scene, step: Step, config: DensifyConfig, steps: int, state:
 
 
 def _spare_grasps(scene: Scene) -> None:
-    """Take the gradient off the frames in which a hand holds the object: they stay as they are."""
+    """Zero the gradient of frames in which a hand holds the object, so that they stay as they are."""
     for side, poses in scene.hand_poses.items():
         held = scene.grasps[side].of_frame >= 0
         for residual in (poses.orient, poses.pose, poses.position.ray, poses.position.log_depth):

@@ -22,7 +22,7 @@ from bigs.types import Entity, Gaussians, RenderOutput, Side
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a stage's terms look at besides the scene; fixed for the stage."""
+    """The data of a stage's terms besides the scene; fixed for the stage."""
 
     targets: Targets
     touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as known
@@ -37,7 +37,7 @@ _COVERED = 0.5
 
 
 class Pixels(NamedTuple):
-    """The M pixels of a joint rendering that count: all others show nothing and should, or are covered."""
+    """The M pixels of a joint rendering that count; all others are rightly empty or covered."""
 
     colors: Tensor  # [M, D] rendered
     alphas: Tensor  # [M, 1] rendered

@@ -1,4 +1,4 @@
-"""Where a run's time goes: what one part ends another begins, so that the parts add up to the whole."""
+"""The time of a run by part: each begins where another ends, so that they add up to the whole."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 
 class Stopwatch:
-    """Seconds by part. Every instant since it was made belongs to exactly one.
+    """Seconds by part. Every instant since its creation belongs to exactly one part.
 
     Args:
         first: what begins now.

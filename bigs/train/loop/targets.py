@@ -1,4 +1,4 @@
-"""What the images say, at the resolution and crop that a stage works at."""
+"""Images and masks at the resolution and crop of a stage."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ Step = Literal["single-subject", "interacting-subjects"]
 
 @dataclass(frozen=True)
 class OptimizeStage:
-    """One stretch of gradient descent: what may move, what it is asked to satisfy, and for how long."""
+    """One stage of gradient descent: what may change, which terms it minimises, and for how long."""
 
     name: str
     # The paper's two steps: every subject rendered alone, or all together.
@@ -47,7 +47,7 @@ class OptimizeStage:
 
 @dataclass(frozen=True)
 class ScaleSearchStage:
-    """The object's size by a one-dimensional search: where do the touching hands touch?"""
+    """The object's size by a one-dimensional search over contact."""
 
     name: str = "object-scale-search"
     step: Step = "interacting-subjects"
@@ -105,7 +105,7 @@ class ObjectMotionStage:
 
 @dataclass(frozen=True)
 class SplitStage:
-    """Fields are evaluated a last time, and Gaussians go on without them (see `models.free_gaussians`)."""
+    """Evaluate the fields a last time and continue with free Gaussians (see `models.free_gaussians`)."""
 
     name: str = "split"
     step: Step = "single-subject"
@@ -198,7 +198,7 @@ Stage = (
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that decides the result of a run, apart from the clip and the hand model."""
+    """Everything that determines the result of a run, except the clip and the hand model."""
 
     seed: int = 0
     initial: InitialConfig = field(default_factory=InitialConfig)

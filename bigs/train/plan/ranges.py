@@ -1,4 +1,4 @@
-"""Between which bounds each number of a configuration makes sense, told where the configuration is read."""
+"""Bounds of every number of a configuration, checked where it is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which background pixels are something in front of it: sleeves, arms, other people.
+"""Background pixels that show unlabelled occluders: sleeves, arms, other people.
 
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
 background is the same in every frame, so whatever differs from its median over time is an unknown occluder.
@@ -24,7 +24,7 @@ _USELESS_SHARE = 0.5
 
 
 def unknown_occluders(clip: Clip) -> np.ndarray:
-    """Where something unlabelled may hide a hand or the object.
+    """Where an unlabelled occluder may hide a hand or the object.
 
     Returns:
         [T, H, W] bool at the clip's size; all False when the background does not stand still.

@@ -38,7 +38,7 @@ from bigs.types import Side
 
 
 class KnownPart(NamedTuple):
-    """What of the object's closed surface something speaks for."""
+    """The part of the object's closed surface with evidence for it."""
 
     verts: Tensor  # [V] indices of its vertices
     faces: Tensor  # [F, 3] among these
@@ -50,7 +50,7 @@ class KnownPart(NamedTuple):
 
 
 class SceneStart(NamedTuple):
-    """A scene at its start values, and what there is to say about them."""
+    """A scene at its start values, and facts about them."""
 
     scene: Scene
     skipped: list[str]  # what was not done, or replaced by something simpler, and why

@@ -1,4 +1,4 @@
-"""The object's surface at the start: what masks and points say, and how it is closed elsewhere."""
+"""The object's start surface: from masks and points, and closed elsewhere."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
 
 @dataclass(frozen=True)
 class Carving:
-    """What the clip's frames leave of the space around the object, and its points there."""
+    """The visual hull from the clip's frames, and the object's points in it."""
 
     hull: DistanceGrid  # to the visual hull; exact up to `InitialConfig.surface_reach`
     shown: np.ndarray  # [X * Y * Z] share of the frames that show object there; 0 outside the hull's reach

@@ -1,4 +1,4 @@
-"""What a clip never showed of the object, by symmetry, where there is strong evidence for one."""
+"""Completion of the object's unseen surface by symmetry, where the evidence is strong."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bigs.train.start.initial import InitialConfig, ObjectStart
 
 @dataclass(frozen=True)
 class CompletionConfig:
-    """When parts that were never seen are completed by symmetry. Lengths in metres."""
+    """When unseen parts are completed by symmetry. Lengths in metres."""
 
     symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
     # Nothing is completed if this share of the surface was seen.
@@ -33,7 +33,7 @@ class CompletionConfig:
 
 @dataclass(frozen=True)
 class Completion:
-    """The object's surface with what was added to it."""
+    """The object's completed surface."""
 
     surface: DistanceGrid
     seen: float  # share of the surface that the clip shows

@@ -143,7 +143,7 @@ def _smooth_positions(positions: Tensor, trust: Tensor, sigma: float) -> Tensor:
 
 @torch.no_grad()
 def initial_trajectory(clip: Clip, hand_models: Mapping[Side, HandModel]) -> HandObjectTrajectory:
-    """The clip's estimates as they are, posed and in camera space: what a reconstruction has to improve on.
+    """The clip's estimates, posed in camera space: the baseline of a reconstruction.
 
     The object is the bare point set of the file.
     """

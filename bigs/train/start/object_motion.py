@@ -85,7 +85,7 @@ def turn_errors(motion: TrackedMotion) -> np.ndarray:
 
 
 def in_words(motion: TrackedMotion) -> str:
-    """What a person should know of it."""
+    """A summary for the user."""
     error = np.degrees(turn_errors(motion))
     text = (
         f"{len(motion.points)} points, rotation known to {np.median(error):.2f} degrees (given to "
@@ -106,7 +106,7 @@ def _digest(clip: Clip, given: GivenPoses, stage: ObjectMotionStage) -> str:
 
 
 def _read(file: Path, digest: str) -> TrackedMotion | None:
-    """What is in the file, if it is whole and of this clip and plan."""
+    """The file's content, if it is whole and belongs to this clip and plan."""
     try:
         # Read as bytes, since numpy leaves a file open that is no archive.
         with np.load(io.BytesIO(file.read_bytes())) as stored:

@@ -1,1 +1,1 @@
-"""What no frame shows of the object: told apart from what was seen, and completed by symmetry or a prior."""
+"""What no frame shows of the object, and its completion by symmetry or a prior."""

@@ -44,7 +44,7 @@ _BLENDED = 24
 
 
 class CompletedScene(NamedTuple):
-    """What there is to tell."""
+    """Facts to report."""
 
     skipped: str | None  # why nothing was changed
     facts: dict[str, str]
@@ -61,7 +61,7 @@ def complete_scene(
     obj: ObjectSplatsConfig,
     earlier: Sequence[Symmetry] = (),
 ) -> CompletedScene:
-    """Let the object's symmetries, if it has any, complete it where the clip never showed it; in place.
+    """Complete the object by its symmetries where the clip never showed it; in place.
 
     The mesh is made anew. Gaussians that show in any frame are left, the others are replaced. If the clip's
     own frames then show worse than the stage allows, all is undone.

@@ -63,7 +63,7 @@ def coverage_of(normals: Tensor, seen: Tensor) -> Coverage:
 
 @dataclass(frozen=True)
 class Guided:
-    """What the prior did."""
+    """The effect of the prior."""
 
     moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
     worst: float  # relative growth of the largest error

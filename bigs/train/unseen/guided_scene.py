@@ -1,4 +1,4 @@
-"""A diffusion prior on the object of a scene: what the clip saw of it, and what the prior may change."""
+"""A diffusion prior on a scene's object: what the clip saw of it, and what the prior may change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a clip has seen of a scene's object, in its poses as they are, and how well it is shown."""
+"""Which of the object's Gaussians a clip shows in the current poses, and how well."""
 
 from __future__ import annotations
 
