@@ -19,6 +19,10 @@ __all__ = [
     "rasterize_backward",
     "rasterize_forward",
     "simd_level",
+    "terms_alone",
+    "terms_alone_backward",
+    "terms_together",
+    "terms_together_backward",
     "time_engine",
 ]
 
@@ -129,6 +133,38 @@ def pose_backward(
 
     `pulls` are those of means, quats and colours; what is not wanted is an empty array.
     """
+
+def terms_together(
+    arrays: tuple[NDArray[Any], ...], frames: tuple[int, ...], covered: float
+) -> tuple[list[float], list[float]]:
+    """Four terms of pictures of all subjects together, and the two areas that they are means over.
+
+    `arrays` are colors [B, H, W, D], alphas [B, H, W, 1], images [T, H, W, 3], foreground, unknown and the
+    labels' shares [T, H, W].
+    """
+
+def terms_together_backward(
+    arrays: tuple[NDArray[Any], ...],
+    frames: tuple[int, ...],
+    covered: float,
+    areas: list[float],
+    v: list[float],
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Flat gradients of colors and alphas from those of the terms."""
+
+def terms_alone(
+    arrays: tuple[NDArray[Any] | None, ...], frames: tuple[int, ...]
+) -> tuple[list[float], float]:
+    """Three terms of pictures of one subject alone, and the area that they are means over.
+
+    `arrays` are alphas [B, H, W, 1], colors [B, H, W, 3] or None, images [T, H, W, 3], own and hidden
+    [T, H, W].
+    """
+
+def terms_alone_backward(
+    arrays: tuple[NDArray[Any] | None, ...], frames: tuple[int, ...], area: float, v: list[float]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Flat gradients of colors, empty where there are none, and of alphas from those of the terms."""
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.moments import Moments
@@ -36,17 +36,6 @@ class Evidence:
 _COVERED = 0.5
 
 
-class Pixels(NamedTuple):
-    """The M pixels of a joint rendering that count; all others are rightly empty or covered."""
-
-    colors: Tensor  # [M, D] rendered
-    alphas: Tensor  # [M, 1] rendered
-    images: Tensor  # [M, 3]
-    foreground: Tensor  # [M]
-    empty: Tensor  # [M] share that shows neither a subject nor an unlabelled occluder
-    shares: Tensor  # [M, E] for the entities rendered
-
-
 @dataclass(frozen=True)
 class Selection:
     """What one step looks at: which subjects, in which frames, and how."""
@@ -68,6 +57,7 @@ class Step:
     canonical: dict[Entity, CanonicalHand | CanonicalObject]  # of the selection's entities
     selection: Selection
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
+    _alone_terms: dict[Entity, AloneTerms] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.selection.pull:
@@ -180,29 +170,40 @@ class Step:
         return self.render(self.clip.at(self.frames).posed(canonical, self.selection.labels))
 
     @cached_property
-    def pixels(self) -> Pixels:
-        """For terms that look at each pixel for itself: hands and object fill a small part of an image.
+    def together_terms(self) -> TogetherTerms:
+        """What each pixel of the joint rendering says.
 
         What something unlabelled covers is left out: behind a sleeve a hand may be, but does not show.
         """
-        rendered, foreground = self.together, self.foreground
-        unknown = _at(self.evidence.targets.unknown, self.frames)
-        counts = ((foreground > 0.0) | (rendered.alphas.squeeze(-1) > 0.0)) & (unknown <= _COVERED)
-        index = torch.nonzero(counts.flatten()).flatten()
-
-        def some(values: Tensor) -> Tensor:
-            return values.flatten(0, 2).index_select(0, index)
-
-        shares = torch.stack([self.share(entity).flatten()[index] for entity in self.entities], dim=-1)
-        shown = some(foreground)
-        return Pixels(
-            some(rendered.colors),
-            some(rendered.alphas),
-            some(self.images),
-            shown,
-            (1.0 - shown - some(unknown)).clamp_min(0.0),
+        targets, rendered = self.evidence.targets, self.together
+        shares = [targets.shares[entity] for entity in self.entities] if self.selection.labels else []
+        return together_terms(
+            rendered.colors,
+            rendered.alphas,
+            targets.images,
+            targets.foreground,
+            targets.unknown,
             shares,
+            self.frames,
+            _COVERED,
         )
+
+    def alone_terms(self, entity: Entity) -> AloneTerms:
+        """What each pixel of one subject's own rendering says."""
+        if entity not in self._alone_terms:
+            rendered = self.alone(entity)
+            self._alone_terms[entity] = self._against_own(entity, rendered.colors, rendered.alphas)
+        return self._alone_terms[entity]
+
+    def silhouette(self, side: Side) -> Tensor:
+        """How far the outline of a hand's few opaque Gaussians is from what its own mask allows."""
+        posed = self.clip.at(self.frames_of(side)).posed_hand(side, self.evidence.silhouettes[side])
+        return self._against_own(side, None, self.render(posed).alphas).coverage
+
+    def _against_own(self, entity: Entity, colors: Tensor | None, alphas: Tensor) -> AloneTerms:
+        targets = self.evidence.targets
+        own, hidden = targets.shares[entity], targets.hidden[entity]
+        return alone_terms(colors, alphas, targets.images, own, hidden, self.frames_of(entity))
 
     @cached_property
     def joints(self) -> dict[Side, Tensor]:

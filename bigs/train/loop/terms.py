@@ -10,9 +10,9 @@ from torch import Tensor
 
 from bigs.checks import check_choice
 from bigs.losses.contact import center_contact, penetration, surface_contact
-from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on, spilled
+from bigs.losses.mask import outside_mask, outside_mask_on
 from bigs.losses.perceptual import masked_perceptual
-from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
+from bigs.losses.photometric import masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.train.loop.step import Step
@@ -25,26 +25,22 @@ def _mean(values: Iterable[Tensor]) -> Tensor:
     return torch.stack(values).mean() if values else torch.zeros(())
 
 
-def _each_alone(step: Step, loss: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
-    return _mean(
-        loss(step.alone(entity).colors, step.images_alone(entity), step.share_alone(entity))
-        for entity in step.entities
-    )
-
-
 def image_alone(step: Step) -> Tensor:
     """|I - I*| of the paper (Eq. 5) over the pixels that each subject shows, a mean over subjects."""
-    return _each_alone(step, masked_l1)
+    return _mean(step.alone_terms(entity).image for entity in step.entities)
 
 
 def mse_alone(step: Step) -> Tensor:
     """(I - I*)² over the pixels that each subject shows, a mean over subjects."""
-    return _each_alone(step, masked_mse)
+    return _mean(step.alone_terms(entity).mse for entity in step.entities)
 
 
 def ssim_alone(step: Step) -> Tensor:
     """1 - SSIM of each subject inside its own mask (paper Eq. 5), a mean over subjects."""
-    return _each_alone(step, masked_ssim)
+    return _mean(
+        masked_ssim(step.alone(entity).colors, step.images_alone(entity), step.share_alone(entity))
+        for entity in step.entities
+    )
 
 
 def mask_alone(step: Step) -> Tensor:
@@ -85,22 +81,17 @@ def perceptual_alone(step: Step) -> Tensor:
 
 def coverage_alone(step: Step) -> Tensor:
     """Each subject opaque on its own pixels, absent from the background, free where others may hide it."""
-    return _mean(
-        amodal_silhouette(
-            step.alone(entity).alphas.squeeze(-1), step.share_alone(entity), step.hidden_alone(entity)
-        )
-        for entity in step.entities
-    )
+    return _mean(step.alone_terms(entity).coverage for entity in step.entities)
 
 
 def image_together(step: Step) -> Tensor:
     """|I - I*| of the paper (Eq. 9) over the pixels that show any subject."""
-    return masked_l1(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
+    return step.together_terms.image
 
 
 def mse_together(step: Step) -> Tensor:
     """(I - I*)² over the pixels that show any subject."""
-    return masked_mse(step.pixels.colors[:, :3], step.pixels.images, step.pixels.foreground)
+    return step.together_terms.mse
 
 
 def ssim_together(step: Step) -> Tensor:
@@ -115,8 +106,7 @@ def mask_together(step: Step) -> Tensor:
 
 def spill(step: Step) -> Tensor:
     """Squared alpha outside all masks, per pixel of the masks, without what something unlabelled covers."""
-    pixels = step.pixels
-    return spilled(pixels.alphas, pixels.empty, pixels.foreground)
+    return step.together_terms.spill
 
 
 def mask_random_together(step: Step) -> Tensor:
@@ -138,18 +128,12 @@ def perceptual_together(step: Step) -> Tensor:
 
 def labels(step: Step) -> Tensor:
     """Squared difference of label channels and masks: which subject each pixel shows, occlusion included."""
-    return label_difference(step.pixels.colors[:, 3:], step.pixels.shares)
+    return step.together_terms.labels
 
 
 def silhouette(step: Step) -> Tensor:
     """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
-
-    def one(side: Side) -> Tensor:
-        posed = step.clip.at(step.frames_of(side)).posed_hand(side, step.evidence.silhouettes[side])
-        alphas = step.render(posed).alphas.squeeze(-1)
-        return amodal_silhouette(alphas, step.share_alone(side), step.hidden_alone(side))
-
-    return _mean(one(side) for side in step.scene.sides if len(step.frames_of(side)))
+    return _mean(step.silhouette(side) for side in step.scene.sides if len(step.frames_of(side)))
 
 
 def color(step: Step) -> Tensor:

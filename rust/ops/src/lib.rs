@@ -20,6 +20,7 @@
 
 mod checks;
 mod lanes;
+pub mod pixels;
 pub mod pose;
 
 pub use bigs_raster::RasterError as OpsError;

@@ -2,6 +2,7 @@
 
 mod convert;
 mod measure;
+mod pixels;
 mod pose;
 mod sh;
 
@@ -320,6 +321,10 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_forward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::terms_together, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::terms_together_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::terms_alone, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::terms_alone_backward, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
     m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }

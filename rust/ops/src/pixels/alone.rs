@@ -1,0 +1,160 @@
+//! One subject rendered without the others.
+
+use bigs_raster::Real;
+use rayon::prelude::*;
+
+use crate::OpsError;
+use crate::pixels::{Frames, RUN, add_run, area, sign};
+
+/// Rendered pictures of one subject, and what the clip shows of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Alone<'a, T> {
+    /// Which frames.
+    pub frames: Frames<'a>,
+    /// Rendered colours, three a pixel; none where only the outline counts.
+    pub colors: Option<&'a [T]>,
+    /// Rendered coverage.
+    pub alphas: &'a [T],
+    /// The clip's colours; not read without rendered ones.
+    pub images: &'a [T],
+    /// The share of a pixel that shows the subject.
+    pub own: &'a [T],
+    /// The share in which something may hide it.
+    pub hidden: &'a [T],
+}
+
+/// The terms, and the area that they are means over.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Terms {
+    /// |difference| and squared difference of colours over the subject's own pixels, and the squared distance of coverage
+    /// from what its mask allows, between `own` and `own + hidden`, per pixel of the subject.
+    pub values: [f64; 3],
+    /// Pixels of the subject.
+    pub own: f64,
+}
+
+impl<T: Real> Alone<'_, T> {
+    fn check(&self) -> Result<(), OpsError> {
+        self.frames.check()?;
+        if let Some(colors) = self.colors {
+            self.frames.check_rendered("colors", colors, 3)?;
+            self.frames.check_clip("images", self.images, 3)?;
+        }
+        self.frames.check_rendered("alphas", self.alphas, 1)?;
+        self.frames.check_clip("own", self.own, 1)?;
+        self.frames.check_clip("hidden", self.hidden, 1)
+    }
+
+    /// The terms, checked.
+    ///
+    /// # Errors
+    /// A length that does not fit, or a frame that the clip does not have.
+    pub fn terms(&self) -> Result<Terms, OpsError> {
+        self.check()?;
+        let [absolute, squared, outside, own] = self.frames.sums(|index| {
+            let mut sums = [0.0; 4];
+            let (alphas, own, hidden) = self.outlines(index);
+            let places = alphas.chunks(RUN).zip(own.chunks(RUN)).zip(hidden.chunks(RUN));
+            for ((alphas, own), hidden) in places {
+                let mut run = [T::ZERO; 4];
+                for ((&alpha, &own), &hidden) in alphas.iter().zip(own).zip(hidden) {
+                    let beyond = alpha - nearest(alpha, own, hidden);
+                    run[2] += beyond * beyond;
+                    run[3] += own;
+                }
+                add_run(&mut sums, run);
+            }
+            let (colors, images) = self.pictures(index);
+            for ((colors, images), own) in colors.chunks(RUN).zip(images.chunks(RUN)).zip(own.chunks(RUN)) {
+                let mut run = [T::ZERO; 4];
+                for ((color, image), &own) in colors.iter().zip(images).zip(own) {
+                    if own > T::ZERO {
+                        let (mut absolute, mut squared) = (T::ZERO, T::ZERO);
+                        for c in 0..3 {
+                            let difference = color[c] - image[c];
+                            absolute += difference.abs();
+                            squared += difference * difference;
+                        }
+                        run[0] += absolute * own;
+                        run[1] += squared * own;
+                    }
+                }
+                add_run(&mut sums, run);
+            }
+            sums
+        });
+        let colors = area(3.0 * own);
+        Ok(Terms {
+            values: [absolute / colors, squared / colors, outside / area(own)],
+            own,
+        })
+    }
+
+    /// Gradients of the rendered colours, empty where there are none, and of the coverage, from those of the terms.
+    ///
+    /// # Errors
+    /// As [`Alone::terms`].
+    pub fn vjp(&self, terms: &Terms, v: [f64; 3]) -> Result<(Vec<T>, Vec<T>), OpsError> {
+        self.check()?;
+        let two = T::of(2.0);
+        let colors = area(3.0 * terms.own);
+        let [absolute, squared, outside] = [v[0] / colors, v[1] / colors, v[2] / area(terms.own)].map(T::of);
+        let size = self.frames.pixels.max(1);
+        let mut v_alphas = vec![T::ZERO; self.alphas.len()];
+        v_alphas
+            .par_chunks_exact_mut(size)
+            .enumerate()
+            .for_each(|(index, v_alphas)| {
+                let (alphas, own, hidden) = self.outlines(index);
+                for (((v, &alpha), &own), &hidden) in v_alphas.iter_mut().zip(alphas).zip(own).zip(hidden) {
+                    *v = outside * two * (alpha - nearest(alpha, own, hidden));
+                }
+            });
+        let mut v_colors = vec![T::ZERO; self.colors.map_or(0, <[T]>::len)];
+        v_colors
+            .par_chunks_exact_mut(3 * size)
+            .enumerate()
+            .for_each(|(index, v_colors)| {
+                let (colors, images) = self.pictures(index);
+                let own = self.frames.of_clip(self.own, index, 1);
+                for (((v, color), image), &own) in v_colors
+                    .as_chunks_mut()
+                    .0
+                    .iter_mut()
+                    .zip(colors)
+                    .zip(images)
+                    .zip(own)
+                {
+                    if own > T::ZERO {
+                        *v = [0, 1, 2].map(|c| {
+                            let difference = color[c] - image[c];
+                            own * (absolute * sign(difference) + squared * two * difference)
+                        });
+                    }
+                }
+            });
+        Ok((v_colors, v_alphas))
+    }
+
+    fn outlines(&self, index: usize) -> (&[T], &[T], &[T]) {
+        (
+            self.frames.of_rendered(self.alphas, index, 1),
+            self.frames.of_clip(self.own, index, 1),
+            self.frames.of_clip(self.hidden, index, 1),
+        )
+    }
+
+    fn pictures(&self, index: usize) -> (&[[T; 3]], &[[T; 3]]) {
+        self.colors.map_or((&[], &[]), |colors| {
+            (
+                self.frames.of_rendered(colors, index, 3).as_chunks().0,
+                self.frames.of_clip(self.images, index, 3).as_chunks().0,
+            )
+        })
+    }
+}
+
+/// The coverage that is allowed next to `alpha`.
+fn nearest<T: Real>(alpha: T, own: T, hidden: T) -> T {
+    alpha.greater(own).lesser(own + hidden)
+}
