@@ -3,9 +3,9 @@
 Key ideas:
 - `rasterization` is an ordinary differentiable torch function: any torch optimiser and any loss work.
 - Train what has no limits: logarithms of scales, logits of opacities and colours. Activate them for the call.
-- Gaussians that lie in a plane before the camera make a two-dimensional picture.
+- Gaussians that lie in a plane in front of the camera make a two-dimensional picture.
 
-The picture is made by code. Writes `fit.png`: the picture, the fit at the start and the fit at the end.
+The picture is generated. Writes `fit.png`: the picture, the fit at the start and the fit at the end.
 
     python examples/fit_image.py --out OUT
 """

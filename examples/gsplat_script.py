@@ -1,4 +1,4 @@
-"""Train Gaussians with a script written for gsplat: only its import is another.
+"""Train Gaussians with a script written for gsplat: only the import differs.
 
 Key ideas:
 - `bigs.raster.gsplat.rasterization` takes gsplat's arguments and returns what gsplat returns, on a CPU.
@@ -6,7 +6,7 @@ Key ideas:
   screen are too few, and are split in two.
 - Colours are spherical harmonics, so they may depend on the direction of view.
 
-The pictures are made by code: a striped ball seen from a ring of cameras. Writes `views.png`: three of them
+The pictures are generated: a striped ball seen from a ring of cameras. Writes `views.png`: three of them
 above what the Gaussians show from there.
 
     python examples/gsplat_script.py --out OUT

@@ -1,7 +1,7 @@
-"""Let a reconstruction play another clip's motion, before another camera.
+"""Let a reconstruction play another clip's motion, seen from another camera.
 
 Key ideas:
-- A finished run is plain tensors (`load_run`): no clip and no hand model is needed to pose it anew.
+- A finished run is plain tensors (`load_run`): no clip and no hand model is needed to pose it again.
 - Gaussians of a hand ride on its skeleton, so any rotations of its joints will do: `repose`.
 - The other clip's hands are used where they are; its object's motion is used relative to its first frame,
   since every reconstruction has an object frame of its own.
@@ -9,7 +9,7 @@ Key ideas:
 Writes the pictures `%04d.png` (white behind the scene) and `strip.png`, which shows some of them: the run as
 it was above, the run in the new motion below.
 
-Without a run two small clips are made by code and the first is reconstructed with the `smoke` preset.
+Without a run two small clips are generated and the first is reconstructed with the `smoke` preset.
 
     python examples/novel_pose.py --out OUT
     python examples/novel_pose.py --run RUN --motion CLIP --hand-model MANO --degrees 60 --out OUT
@@ -65,7 +65,7 @@ def main(
         motion: a clip of any layout, whose hands and object move; without it one is made.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl) that the clip's poses belong to.
         degrees: by how much the camera is turned about the scene.
-        frames: length of the clips that are made by code.
+        frames: length of the clips that are generated.
 
     Returns:
         The run in its new poses.

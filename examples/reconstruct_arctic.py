@@ -6,7 +6,7 @@ Key ideas:
 - ARCTIC's annotation only scores: `--truth` names the folder that holds raw_seqs/ and meta/.
 - `arctic_preds.zip` is written when every sequence is done, and checked as the server reads it.
 
-Without data a small sequence is made by code and written as the challenge and as ARCTIC lay it out.
+Without data a small sequence is generated and written as the challenge and as ARCTIC lay it out.
 
     python examples/reconstruct_arctic.py --out OUT
     python examples/reconstruct_arctic.py --data HANDS --hand-model MANO --preset full --out OUT
@@ -65,7 +65,7 @@ def main(
         sequences: names as the challenge has them; the nine of subject 3 and camera 1 if not given.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl), which ARCTIC's poses need.
         preset: how much work to put in.
-        frames: length of the sequence that is made by code.
+        frames: length of the sequence that is generated.
 
     Returns:
         The zip.

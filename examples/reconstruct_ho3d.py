@@ -6,7 +6,7 @@ Key ideas:
 - The limited view keeps the quarter of the frames that see the object from the fewest sides.
 - Poses of HO-3D are absolute and its camera has OpenGL axes; the loader turns both, once.
 
-Without data a small clip of one hand is made by code and written as both lay it out.
+Without data a small clip of one hand is generated and written as both lay it out.
 
     python examples/reconstruct_ho3d.py --out OUT
     python examples/reconstruct_ho3d.py --data HOLD --truth HO3D --clips SM1 MPM10 --view limited \\
@@ -52,13 +52,13 @@ def main(
 
     Args:
         out: folder to make: clips, a run for each, the table of scores. Finished runs are kept.
-        data: HOLD's folders hold_CLIP_ho3d/build; without it a clip is made by code.
+        data: HOLD's folders hold_CLIP_ho3d/build; without it a clip is generated.
         truth: HO-3D's release, with the YCB models in models/.
         clips: names of clips, as HO-3D has them.
         view: full, or the paper's limited view.
         hand_model: folder with MANO_RIGHT (.npz or .pkl), which HO-3D's poses need.
         preset: how much work to put in.
-        frames: length of the clip that is made by code.
+        frames: length of the clip that is generated.
 
     Returns:
         The scores of the last clip.

@@ -6,7 +6,7 @@ Key ideas:
 - What a step left is used again as long as its inputs are the same; another tool may supply it.
 - `bigs reconstruct video.mp4 --masks DIR --keypoints FILE --focal F --out RUN` does the same.
 
-Without a video one is made by code, with masks, keypoints that err by a pixel, and its truth.
+Without a video one is generated, with masks, keypoints that err by a pixel, and its truth.
 
     python examples/reconstruct_video.py --out OUT
     python examples/reconstruct_video.py --video video.mp4 --masks MASKS --keypoints keypoints.json \\
@@ -62,13 +62,13 @@ def main(
 
     Args:
         out: folder to make: the clip with what each step left, and the run.
-        video: a video, or a folder of images; without it one is made by code.
+        video: a video, or a folder of images; without it one is generated.
         masks: folder of label masks (0, 50 object, 150 right, 250 left), one for each frame.
         keypoints: JSON file of 21 keypoints of each hand in each frame.
         focal: focal length in pixels; from the file or assumed if not given.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
         preset: how much work to put in.
-        frames: length of the video that is made by code.
+        frames: length of the video that is generated.
 
     Returns:
         The run.

@@ -1,7 +1,7 @@
 """Train a small diffusion prior on a family of objects, and see what it knows of others of that family.
 
 Key ideas:
-- `bigs prior train` needs nothing but a folder of meshes; here they are made by code.
+- `bigs prior train` needs nothing but a folder of meshes; here they are generated.
 - Of each held-out object the front half is right and the back is flat, as if a clip had never shown it. Score
   distillation moves the Gaussians of the back, and the mesh follows.
 - What was seen gets no gradient. The score is taken on the half that was never seen.

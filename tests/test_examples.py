@@ -130,7 +130,7 @@ def test_reconstruct_arctic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
     assert "8 frames submitted" in " ".join(rows[f"{example.STAND_IN}: 8 frames submitted"])
     # The paper's figures are of ARCTIC's own clips.
-    assert f"{example.STAND_IN} (8 frames, made by code)" in rows
+    assert f"{example.STAND_IN} (8 frames, generated)" in rows
     assert not any(name.startswith("paper") for name in rows)
     # Called again it keeps its run and packs the same zip.
     before = archive.read_bytes()
@@ -152,7 +152,7 @@ def test_reconstruct_arctic_says_what_it_needs(tmp_path: Path) -> None:
 def test_reconstruct_ho3d(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scores = load("reconstruct_ho3d").main(tmp_path / "ho3d", frames=16, view="limited")
     text = capsys.readouterr().out
-    assert "limited: directions within" in text and "made by code" in text
+    assert "limited: directions within" in text and "generated" in text
     assert "mpjpe_ra_l" not in scores and 0 < scores["mpjpe_ra_r"] < 40
     assert len(load_hold(tmp_path / "ho3d" / "clips" / "SYN1_limited")) == 4
     assert "SYN1_limited" in (tmp_path / "ho3d" / "comparison.md").read_text()

@@ -1,4 +1,4 @@
-"""Whether a clip's estimates can be of two hands that hold something before a camera.
+"""Checks that a clip's estimates are plausible for two hands in front of a camera.
 
 What cannot be is refused, in one sentence. Single faults are taken out, as if they had never been estimated,
 and what is merely odd is kept; both leave a note in the clip.

@@ -8,7 +8,7 @@
                           [T, 3], `right_betas` [10], as poses.npz has them: OpenCV camera frame, metres.
                           Optional: `right_valid` [T], and `object_scale`, metres per unit of the points
 
-The model's world is the object, so its cameras tell how the object moved before a camera that stood still.
+The model's world is the object, so its cameras tell how the object moved in front of a still camera.
 Frames that the model lacks are filled from their neighbours. Without `object_scale` the object is put as far
 away as the hands are.
 """

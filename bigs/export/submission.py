@@ -66,7 +66,7 @@ def write_submission(
             calls its methods. Such a file opens only where that class is, or by a reader that knows it.
 
     Raises:
-        InputError: not exactly these sequences, or a prediction that is not as it should be.
+        InputError: not exactly these sequences, or an invalid prediction.
     """
     _check_names(str(path), [file.stem for file in predictions], sequences)
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""A hand made by code, so that everything runs without any model file.
+"""A generated hand, so that everything runs without a model file.
 
 Joint tree, axes and number of shapes as in a MANO-format file; no pose correctives, flat mean pose.
 """

@@ -134,7 +134,7 @@ def read_frame_set(processed: Path) -> FrameSet:
     """Read `frames.json`.
 
     Raises:
-        InputError: missing, damaged, or a field is not as it should be.
+        InputError: missing, damaged, or a field is invalid.
     """
     file = processed / FRAMES_FILE
     stored = _read_json(file)
@@ -226,7 +226,7 @@ def read_hands(path: Path, frames: int) -> dict[Side, HandTrack]:
         frames: how many frames the clip has.
 
     Raises:
-        InputError: missing, damaged, no hand in it, or a field is not as it should be.
+        InputError: missing, damaged, no hand in it, or a field is invalid.
     """
     stored = _read_npz(path)
     sides = [side for side in SIDES if f"{side}.global_orient" in stored]
@@ -269,7 +269,7 @@ def read_object_sfm(path: Path, frames: int) -> ObjectSfm:
     """Read `object_sfm.npz`; colours are optional in it, grey then.
 
     Raises:
-        InputError: missing, damaged, or a field is not as it should be.
+        InputError: missing, damaged, or a field is invalid.
     """
     stored = _read_npz(path)
     field = _fields_of(path, stored, "")
@@ -305,7 +305,7 @@ def read_alignment(path: Path, frames: int) -> Alignment:
     """Read `aligned.npz`.
 
     Raises:
-        InputError: missing, damaged, or a field is not as it should be.
+        InputError: missing, damaged, or a field is invalid.
     """
     stored = _read_npz(path)
     field = _fields_of(path, stored, "")

@@ -57,7 +57,7 @@ def convert(
         What was done, as rows of text.
 
     Raises:
-        InputError: the clip is not as it should be, has no masks, or holds the truth, which is only
+        InputError: the clip is invalid, has no masks, or holds the truth, which is only
             taken as a start when asked for.
     """
     if (out / "build").exists():

@@ -19,7 +19,7 @@ def describe_clip(path: Path, hand_model: Path | None = None) -> list[tuple[str,
         hand_model: folder or file of MANO-format models; None takes the built-in hand.
 
     Raises:
-        InputError: the clip is not as it should be.
+        InputError: the clip is invalid.
     """
     clip = open_clip(path, load_hand_models(hand_model))
     K = clip.K

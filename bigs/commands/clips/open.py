@@ -19,7 +19,7 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
     """A clip of any layout that `bigs.data.layouts` knows, with single faults repaired and noted.
 
     Raises:
-        InputError: the clip is not as it should be, or cannot be of hands before a camera.
+        InputError: the clip is invalid or implausible.
     """
     clip = load_clip(path, hand_models["right"].hands_mean.double().numpy())
     wrists = {
@@ -33,7 +33,7 @@ def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
     """A clip from which a reconstruction can start: with masks, and with estimates that are not the truth.
 
     Raises:
-        InputError: the clip is not as it should be, or holds a data set's annotation.
+        InputError: the clip is invalid, or holds a data set's annotation.
     """
     clip = open_clip(path, hand_models)
     if clip.annotated:

@@ -35,7 +35,7 @@ def load_truth(
         The trajectory; NaN in frames that the data set does not annotate.
 
     Raises:
-        InputError: no truth there, or it is not as it should be.
+        InputError: no truth there, or it is invalid.
     """
     if is_own_truth(path):
         return _frames_of(load_ground_truth(path), frame_names)
@@ -68,7 +68,7 @@ def read_annotation(
     """A data set's annotation of some frames, by their own names.
 
     Raises:
-        InputError: no data set there, or it is not as it should be.
+        InputError: no data set there, or it is invalid.
     """
     clip = find_ho3d(path) if path.is_dir() else None
     if clip is not None:

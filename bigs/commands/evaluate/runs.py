@@ -94,7 +94,7 @@ def evaluate_run(
     """Score a run into its `metrics.json`, which keeps its initial estimates' scores, and `frames.csv`.
 
     Raises:
-        InputError: the run, the truth or the clip is not as it should be, they list different frames, or
+        InputError: the run, the truth or the clip is invalid, they list different frames, or
             there is nothing to score against.
     """
     playback = load_run(run)
@@ -167,7 +167,7 @@ def _input_of(playback: Playback, truth: Path | None, clip: Path | None) -> RunI
     places = [place for path in (truth, clip) if path is not None for place in (path, *path.parents)]
     told = f"{len(playback)} frames"
     if any((place / MADE_BY_CODE).is_file() for place in places):
-        return RunInput("", f"{told}, made by code")
+        return RunInput("", f"{told}, generated")
     data_set = ""
     if truth is not None and not is_own_truth(truth):
         data_set = "HO-3D" if truth.is_dir() and find_ho3d(truth) is not None else "ARCTIC"

@@ -23,7 +23,7 @@ def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | Non
         None when the run's own clip has moved or changed since: that is not worth a refusal.
 
     Raises:
-        InputError: the given clip is not as it should be, or not the run's.
+        InputError: the given clip is invalid, or not the run's.
     """
     if given is not None:
         clip = open_clip(given, load_hand_models(None))

@@ -47,7 +47,7 @@ def view(
         gt: ground truth to show beside the result.
 
     Raises:
-        InputError: the run, the clip or the truth is not as it should be, viser is not installed, or the
+        InputError: the run, the clip or the truth is invalid, viser is not installed, or the
             address cannot be listened at.
     """
     playback = load_run(run)

@@ -68,7 +68,7 @@ def read_hand_dump(file: Path, frames: FrameSet, hands_mean: Mapping[Side, np.nd
         hands_mean: [15, 3] of each side's model, which HOLD's poses are relative to.
 
     Raises:
-        InputError: unreadable, of none of these layouts, or a field is not as it should be.
+        InputError: unreadable, of none of these layouts, or a field is invalid.
     """
     stored = _load(file)
     if any(f"j3d.{side}" in stored for side in SIDES):

@@ -227,10 +227,8 @@ def test_a_run_without_left_hand_stands_beside_table_2() -> None:
 
 def test_the_papers_rows_stand_beside_its_own_data_alone() -> None:
     one = {"mpjpe_ra_r": 10.0, "mpjpe_ra_l": 10.0, "psnr_full": 20.0}
-    two, drawn = beside_paper({"a": one}, {"a": RunInput("", "16 frames, made by code")})
-    assert (
-        [row[0] for row in two.rows] == [row[0] for row in drawn.rows] == ["", "a (16 frames, made by code)"]
-    )
+    two, drawn = beside_paper({"a": one}, {"a": RunInput("", "16 frames, generated")})
+    assert [row[0] for row in two.rows] == [row[0] for row in drawn.rows] == ["", "a (16 frames, generated)"]
     assert "ARCTIC" not in two.title and "paper" not in drawn.title
     two, drawn = beside_paper({"a": one}, {"a": RunInput("ARCTIC")})
     assert "paper: BIGS" in {row[0] for row in two.rows}
