@@ -61,7 +61,7 @@ def steps_listener(console: Console, description: str) -> Iterator[Callable[[dic
 
 
 def _speak(lines: Spoken, event: dict[str, Any]) -> None:
-    """A line for each stage and each note; steps are told by reminders."""
+    """A line for each stage and each note; reminders report the steps."""
     if event["event"] == "stage":
         lines.say(f"{event['index'] + 1}/{event['stages']} {event['stage']}")
     elif event["event"] == "note":

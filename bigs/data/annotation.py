@@ -1,4 +1,4 @@
-"""What a dataset holds to be true of a sequence: poses in its own world, cameras, and the object's mesh."""
+"""A data set's annotation of a sequence: poses in its own world, cameras, and the object's mesh."""
 
 from __future__ import annotations
 

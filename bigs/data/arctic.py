@@ -207,7 +207,7 @@ def _intrinsics(where: str, meta: Mapping[str, Any]) -> np.ndarray:
 
 
 def _subject_meta(view: ArcticView) -> tuple[str, Mapping[str, Any]]:
-    """What misc.json says of the subject, and how messages call that place."""
+    """The subject's entry of misc.json, and its name in messages."""
     file = view.root / "meta" / "misc.json"
     where = f"{file}: {view.subject}"
     meta = mapping_field(str(file), read_json(file))
@@ -271,7 +271,7 @@ def _optics(view: ArcticView, annotation: Annotation, image_paths: Sequence[Path
 
 
 def _crop_boxes(view: ArcticView, frame_names: Sequence[str]) -> np.ndarray:
-    """What part of the whole picture each cropped image shows, [T, 4] left, top, right, bottom."""
+    """The part of the whole picture that each cropped image shows, [T, 4] left, top, right, bottom."""
     places = [view.root / place / view.subject / f"{view.sequence}.npy" for place in _PROCESSED_FOLDERS]
     file = next((place for place in places if place.is_file()), None)
     if file is None:

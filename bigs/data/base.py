@@ -1,4 +1,4 @@
-"""What a clip is once it is loaded: paths, camera, and per-frame initial estimates. Numpy, metres, radians.
+"""A loaded clip: paths, camera, and per-frame initial estimates. Numpy, metres, radians.
 
 A clip's world is whatever the dataset chose; `cam_from_world` leads to the OpenCV camera of each frame.
 """

@@ -1,4 +1,4 @@
-"""Taking fields out of somebody else's dictionary: present, of the right kind and shape, finite.
+"""Fields of a foreign dictionary: present, of the right type and shape, finite.
 
 `where` is the text that names the field in a message: the file, then the path of keys, as in
 `clip/build/data.npy: entities.right.hand_poses`.

@@ -1,4 +1,4 @@
-"""Which layout a path has, and its clip, whatever the layout."""
+"""Recognises the layout of a path and loads its clip."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ _OBJ_PARTS = re.compile(rb"^[ \t]*(?:usemtl|mtllib|[go])\b", re.MULTILINE)
 
 
 def load_mesh_file(file: Path, what: str, load: Callable[..., Any], *, materials: bool = False) -> Any:
-    """What trimesh makes of a file: nothing is merged.
+    """Load a file with trimesh, without merging anything.
 
     Args:
         file: one of `MESH_SUFFIXES`.
@@ -141,7 +141,7 @@ def _checked_obj(content: bytes, *, materials: bool) -> bytes:
 
 
 def _check_glb(content: bytes) -> None:
-    """Its accessors lie in its bytes, its meshes are used so many times, and its pictures are such."""
+    """Check a GLB: accessors within its bytes, a bounded number of mesh uses, and acceptable pictures."""
     _, _, _, size, kind = struct.unpack_from("<4sIIII", content)
     if kind != _GLB_JSON or 20 + size > len(content):
         raise ValueError("a GLB file without its description")

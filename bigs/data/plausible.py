@@ -1,7 +1,7 @@
 """Checks that a clip's estimates are plausible for two hands in front of a camera.
 
-What cannot be is refused, in one sentence. Single faults are taken out, as if they had never been estimated,
-and what is merely odd is kept; both leave a note in the clip.
+The impossible is refused in one sentence. Single faults are removed like missing estimates, and what is
+merely odd is kept; both leave a note in the clip.
 """
 
 from __future__ import annotations

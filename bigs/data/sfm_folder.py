@@ -57,7 +57,7 @@ _LEAST_FOCAL = 1e-3
 
 
 class SfmModel(NamedTuple):
-    """What structure from motion found, in its own unit."""
+    """The result of structure from motion, in its own unit."""
 
     K: np.ndarray  # [3, 3]
     poses: dict[str, np.ndarray]  # stem of an image -> [4, 4] model to camera, OpenCV axes

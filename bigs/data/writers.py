@@ -205,7 +205,8 @@ def write_nerfstudio(folder: str | Path, clip: Clip) -> Path:
 
 
 def _sfm_frames(folder: str | Path, clip: Clip) -> tuple[Path, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """What both kinds share: frames, masks and hands; and the object's poses and points in their own unit."""
+    """What both layouts share: frames, masks and hands, and the object's poses and points in their own
+    unit."""
     folder, track = Path(folder), clip.object
     if track is None or not np.allclose(clip.cam_from_world, np.eye(4)):
         raise InputError(f"{clip.folder}: expected an object in the camera's own frame, found another clip")

@@ -2,7 +2,7 @@
 
 The visual hull is right where the object is convex and wrong in hollows and where a hand always hid the
 background; points with normals are right where there are points. The two are blended by the distance to the
-nearest point, and the hull is cut back to the points' convex hull where nothing speaks for it.
+nearest point, and the hull is cut back to the points' convex hull where there is no evidence beyond it.
 """
 
 from __future__ import annotations

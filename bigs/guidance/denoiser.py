@@ -12,7 +12,7 @@ EdgeDetector = Callable[[Tensor], Tensor]
 
 
 class Conditions(NamedTuple):
-    """What is known about each of B pictures. Prompts are the adapter's own, chosen by the view.
+    """The conditions of B pictures. Prompts are the adapter's own, chosen by the view.
 
     Azimuth 0 is the front, the side of the object that the caller calls so; seen from above it grows
     anticlockwise. Elevation 0 is level, pi / 2 looks straight down on the object.

@@ -21,7 +21,7 @@ from bigs.guidance.token_file import Token, add_token, read_token
 
 @dataclass(frozen=True)
 class DiffusionConfig:
-    """Which Stable Diffusion, and how it is asked. The two scales are those of the paper's released code."""
+    """Which Stable Diffusion, and its settings. The two scales are those of the paper's released code."""
 
     model: str  # folder as diffusers saves it, or a name on the Hugging Face hub
     controlnet: str | None = None  # likewise; a soft-edge ControlNet
@@ -164,7 +164,7 @@ def edge_detector(weights: Path | None) -> EdgeDetector:
 
 
 def encode_text(parts: Parts, prompts: Sequence[str]) -> Tensor:
-    """What the UNet attends to, [P, L, width], for P prompts padded to L words.
+    """The text embeddings [P, L, width] of P prompts padded to L words.
 
     Raises:
         InputError: a prompt has more words than the text encoder takes.

@@ -35,7 +35,7 @@ PREDICTIONS = ("epsilon", "v_prediction", "sample")
 
 @dataclass(frozen=True)
 class Parts:
-    """What a folder holds: frozen networks on their device. Typed loosely, as diffusers is."""
+    """The content of a folder: frozen networks on their device. Typed loosely, as diffusers is."""
 
     unet: Any
     vae: Any  # always float32: its encoder is differentiated

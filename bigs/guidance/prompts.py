@@ -1,4 +1,4 @@
-"""What a text-to-image model is told about the object, depending on where it is looked at from."""
+"""Prompts for a text-to-image model, depending on the view."""
 
 from __future__ import annotations
 

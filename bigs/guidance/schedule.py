@@ -1,4 +1,4 @@
-"""How noisy the pictures are that the prior judges, and how much its judgement counts."""
+"""The noise of the pictures that the prior judges, and the weight of its gradient."""
 
 from __future__ import annotations
 

@@ -175,7 +175,8 @@ def _keeps_normals(
 def _merge(
     vertices: np.ndarray, faces: np.ndarray, keep: np.ndarray, gone: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Let `keep` stand for `gone`, drop faces that became edges, renumber; also which vertices are left."""
+    """Replace `gone` by `keep`, drop faces that became edges, renumber; also returns the remaining
+    vertices."""
     number = np.arange(len(vertices))
     number[gone] = keep
     faces = number[faces]

@@ -12,7 +12,7 @@ from bigs.models.hand_splats import HandSplats
 
 
 class HandDetail(FreeGaussians):
-    """A canonical right hand without a field; takes the place of `HandSplats` in a scene.
+    """A canonical right hand without a field; replaces `HandSplats` in a scene.
 
     How its Gaussians follow the shape and the bones is settled: it stays as the field left it.
     """

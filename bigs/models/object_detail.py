@@ -16,7 +16,7 @@ _SIGMA_PER_SPACING = 0.6
 
 
 class ObjectDetail(FreeGaussians):
-    """A canonical object without a field; takes the place of `ObjectSplats` in a scene."""
+    """A canonical object without a field; replaces `ObjectSplats` in a scene."""
 
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; see `split_object`."""

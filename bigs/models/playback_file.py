@@ -92,7 +92,7 @@ def load_playback(path: Path) -> Playback:
     if stored != expected:
         raise InputError(
             f"{path}: expected the checksum {expected} of its content, found {shown(stored)}: the file was "
-            "damaged (bigs reconstruct --resume into the same folder writes it anew)"
+            "damaged (bigs reconstruct --resume into the same folder writes it again)"
         )
     if facts["format"] == _UNSUMMED:
         tensors |= _without_grasps(tensors)

@@ -50,7 +50,7 @@ class _Crop(NamedTuple):
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Let COLMAP log nothing that does not end it, for as long as the block lasts: failures are told here."""
+    """Silence COLMAP's log in the block, except for fatal errors; failures are reported by bigs."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:

@@ -1,4 +1,4 @@
-"""Points of the map measured anew in every frame that could show them, by their picture.
+"""Points of the map measured again by patches, in every frame that could show them.
 
 A feature is found again over some thirty degrees of turn, so that a map of features is a chain of short
 links and drifts. Once a map is there, it tells how the surface about a point looks from anywhere: the patch

@@ -1,4 +1,4 @@
-"""A grown map made anew from its poses, and with parts of it where other partial models put them.
+"""A grown map rebuilt from its poses, and with parts of it at the poses of other partial models.
 
 Growing decides early what is a point and what a stray, and bends where little was seen. Adjusted once more
 from its poses alone, with every sighting believed again, the map forgets that. Where it crossed few sightings
@@ -44,7 +44,7 @@ def refine(
     start: np.ndarray,
     config: RefineConfig,
 ) -> tuple[ObjectMap, float]:
-    """The map adjusted anew, from its own poses or from those with a partial model spliced in.
+    """The map rebuilt from its own poses, or from those with a partial model spliced in.
 
     Args:
         map_: with a pose in every frame.

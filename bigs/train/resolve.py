@@ -28,7 +28,7 @@ def resolve(config: RunConfig, has_object: bool = True) -> Resolved:
 
     Args:
         config: any plan.
-        has_object: whether the clip has an object; without one nobody misses a prior.
+        has_object: whether the clip has an object; without one no prior is needed.
     """
     config, perceptual = _with_network(config)
     config, prior = _with_prior(config)

@@ -83,7 +83,7 @@ def run_batch(
     at_once: int,
     listen: Listener = lambda text: None,
 ) -> BatchResult:
-    """Run every unfinished clip of the plan. The summary is written anew after each.
+    """Run every unfinished clip of the plan. The summary is updated after each.
 
     A clip that fails, or whose worker is killed, is tried again as often as the plan says and goes on from
     its last checkpoint; one whose files are refused is not. None of them stops another.
@@ -202,7 +202,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def share_threads(workers: int, threads: int, jobs: int) -> tuple[int, int]:
-    """How many jobs at once and how many threads for each; 0 stands for "as this machine has them".
+    """The number of jobs at once and of threads for each; 0 means as many as this machine has.
 
     Raises:
         InputError: a negative number.

@@ -170,7 +170,7 @@ def _with_blob(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _with_outliers(clip: Clip, share: float, rng: np.random.Generator) -> Clip:
-    """The clip with gross errors in a share of the frames; estimates that are told to be missing stay so."""
+    """The clip with gross errors in a share of the frames; missing estimates stay missing."""
 
     def turned_hand(side: Side, track: HandTrack) -> HandTrack:
         hit, turns, shifts = _gross(len(clip), share, rng)

@@ -17,7 +17,7 @@ from bigs.types import Side
 
 
 def clip_of_run(run: Path, frames: int, given: Path | None = None) -> Clip | None:
-    """The clip of a run of so many frames: the one that is given, or the one that the run names.
+    """The clip of a run, with as many frames: the given one, or the one that the run names.
 
     Returns:
         None when the run's own clip has moved or changed since: that is not worth a refusal.

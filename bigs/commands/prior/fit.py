@@ -166,11 +166,11 @@ def read_state(path: Path, form: str, origin: str, of_what: str) -> tuple[dict[s
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise InputError(
-            f"{path}: expected a readable state, found: {error} (remove it to start anew)"
+            f"{path}: expected a readable state, found: {error} (remove it to start again)"
         ) from error
     if metadata.get("format") != form or metadata.get("origin") != origin:
         raise InputError(
-            f"{path}: expected a state of {of_what}, found one of others (remove it to start anew)"
+            f"{path}: expected a state of {of_what}, found one of others (remove it to start again)"
         )
     return state, int(metadata["step"])
 

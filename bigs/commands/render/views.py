@@ -69,7 +69,7 @@ def render_run(
         wanted: `pictures/%04d.png` are RGBA with straight colour, or RGB where there is a background;
             `pictures/depth/%04d.png` are 16-bit millimetres and `.npy` float32 metres of camera z, both 0
             where half of the light or more passes.
-        listen: is told how far it is.
+        listen: receives the progress.
 
     Raises:
         InputError: the run or the cameras are not as they should be, options that do not go together, or no

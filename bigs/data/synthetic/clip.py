@@ -206,7 +206,7 @@ def _project(points: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _seen(points: np.ndarray, K: np.ndarray, picture: Picture, label: int) -> np.ndarray:
-    """Which points [N] (camera frame, on a surface) are what the camera sees there, bool."""
+    """Which points [N] (camera frame, on a surface) the camera sees, bool."""
     height, width = picture.mask.shape
     column, row = np.floor(_project(points, K)).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -31,7 +31,7 @@ _PALM_SIDE = (0, 1, 4, 7, 10, 13)
 
 
 class HandLike(Protocol):
-    """What is needed of a hand model: `bigs.hand.HandModel` is one."""
+    """The interface of a hand model that is needed here; `bigs.hand.HandModel` has it."""
 
     faces: torch.Tensor
     lbs_weights: torch.Tensor

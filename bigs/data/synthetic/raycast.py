@@ -32,7 +32,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Picture:
-    """What the camera sees."""
+    """The camera's image, labels and depth."""
 
     image: np.ndarray  # [H, W, 3] in [0, 1]
     mask: np.ndarray  # [H, W] uint8 labels of the nearest body, 0 where none

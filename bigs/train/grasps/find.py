@@ -60,7 +60,7 @@ def find_grasps(
     """Find the grasps of every hand in the scene as it is, and let the object carry the hand through them.
 
     The estimates propose grasps. Each is then carried with the object to all frames, and what the masks say
-    there decides which frames it has: grasps grow, shrink, take the place of one another, or go.
+    there decides which frames it has: grasps grow, shrink, replace one another, or vanish.
 
     All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
     estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an

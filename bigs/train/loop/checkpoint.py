@@ -83,7 +83,7 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
     if not path.exists():
         return None
     check_regular(path, "a checkpoint")
-    damaged = f"{path}: expected a checkpoint, found a damaged file (remove it to start anew)"
+    damaged = f"{path}: expected a checkpoint, found a damaged file (remove it to start again)"
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -107,8 +107,8 @@ class Fates(NamedTuple):
 def fates(whole: CanonicalObject, pull: Tensor, radius: float, config: DensifyConfig) -> Fates:
     """Decide over N Gaussians by their mean pull [N] on an object of some radius (metres).
 
-    Whom the ceiling leaves no room are those with the least pull; whom the floor spares, the more opaque and
-    the shorter. What pull splits is not pruned for its length.
+    The ceiling excludes those with the least pull; the floor keeps the more opaque and the shorter. A
+    Gaussian that is split is not pruned for its length.
     """
     count = len(pull)
     transparent = whole.opacities < config.least_opacity

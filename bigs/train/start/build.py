@@ -79,7 +79,7 @@ def build_scene(
         lighting: whether colours depend on the direction a surface faces.
         completion: where much of the object was never seen, its symmetries are looked for; if it has none,
             hands meet nothing there. Otherwise, and without it, they meet the closed surface.
-        motion: of the object, if tracks were asked; it takes the place of the smoothed estimates.
+        motion: of the object, if tracks were used; it replaces the smoothed estimates.
     """
     starts = {
         side: smooth_hand(

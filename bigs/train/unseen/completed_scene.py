@@ -63,7 +63,7 @@ def complete_scene(
 ) -> CompletedScene:
     """Complete the object by its symmetries where the clip never showed it; in place.
 
-    The mesh is made anew. Gaussians that show in any frame are left, the others are replaced. If the clip's
+    The mesh is made again. Gaussians that show in any frame are kept, the others are replaced. If the clip's
     own frames then show worse than the stage allows, all is undone.
 
     Args:
