@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from bigs.checks import InputError, check_choice
 from bigs.train.loop.density import DensifyConfig
-from bigs.train.loop.optim import GROUPS
+from bigs.train.loop.optim import GROUPS, ONLY_FREE, ONLY_IN_FIELDS
 from bigs.train.loop.terms import terms_of
 from bigs.train.plan.config import (
     CompletionStage,
@@ -50,6 +50,7 @@ def check_plan(config: RunConfig) -> None:
                     raise InputError(f"{where}: expected {name} with step single-subject, found {stage.step}")
             if stage.densify is not None:
                 _check_densify(f"{where}.densify", stage, stage.densify, config.stages)
+    _check_parameters(config)
     for name, (*others, last) in COMPILED.items():
         value = getattr(config.raster, name)
         if value not in (*others, last):
@@ -61,6 +62,34 @@ def _check_names(where: str, stage: OptimizeStage) -> None:
     for group in stage.lrs:
         check_choice(where, group, GROUPS, "groups")
     terms_of(stage, where)
+
+
+def _check_parameters(config: RunConfig) -> None:
+    """Refuse a rate of something that nothing has by the time its stage runs."""
+    freed: dict[str, str] = {}  # the stage with which a subject's Gaussians left their field
+    for stage in config.stages:
+        if isinstance(stage, SplitStage):
+            freed |= dict.fromkeys(("hand", "object") if stage.hands else ("object",), stage.name)
+        elif isinstance(stage, CompletionStage | GuidanceStage):
+            return  # whether the object leaves its field there depends on the clip
+        elif isinstance(stage, OptimizeStage):
+            for group in stage.lrs:
+                _check_group(f"config stages.{stage.name}.lrs", group, freed.get(group.split(".")[0]))
+                if group.startswith("scene.") and not config.lighting:
+                    raise InputError(
+                        f"config stages.{stage.name}.lrs: expected {group} with lighting, found lighting off "
+                        "(--without lighting leaves out both)"
+                    )
+
+
+def _check_group(where: str, group: str, freed: str | None) -> None:
+    subject = group.split(".")[0]
+    if freed is None and group in ONLY_FREE.get(subject, ()):
+        raise InputError(f"{where}: expected {group} after a split stage, found none before")
+    if freed is not None and group in ONLY_IN_FIELDS.get(subject, ()):
+        raise InputError(
+            f"{where}: expected {group} before the {subject} leaves its field, found it after {freed}"
+        )
 
 
 def _check_densify(

@@ -38,6 +38,7 @@ from bigs.train.plan.config import (
     SplitStage,
     Stage,
 )
+from bigs.train.resolve import asks_prior
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
 from bigs.train.start.object_motion import find_object_motion, in_words
@@ -127,7 +128,7 @@ def fit(
         report = FitReport(**position.report)
         report.before = sum(report.seconds.values())
         watch.add(report.seconds)
-    sources = EvidenceSource(clip, unknown, scene, config, perceptual)
+    sources = EvidenceSource(clip, unknown, scene, config, perceptual, denoiser)
 
     def keep(index: int, state: StageState | None) -> None:
         """Save the state of the running stage, or of the one that has just ended."""
@@ -260,7 +261,7 @@ def _check_networks(config: RunConfig, perceptual: VggWeights | None, denoiser: 
     for stage in config.stages:
         if isinstance(stage, OptimizeStage) and "perceptual" in stage.weights and perceptual is None:
             raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
-        if isinstance(stage, GuidanceStage) and denoiser is None:
+        if asks_prior(stage) and denoiser is None:
             raise InputError(f"stage {stage.name}: expected a prior's model, found none")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig
+from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig, Stage
 from bigs.train.switches import without
 
 
@@ -22,7 +22,7 @@ class Resolved(NamedTuple):
 
 
 def resolve(config: RunConfig, has_object: bool = True) -> Resolved:
-    """Leave out the term "perceptual" without its network, and the stages for which there is no prior.
+    """Leave out the term "perceptual" without its network, and what asks a prior without its weights.
 
     What is resolved stays as it is when it is resolved again.
 
@@ -55,13 +55,22 @@ def _with_prior(config: RunConfig) -> tuple[RunConfig, str | None]:
     if config.prior.kind == "off":
         config = _leave_out(config, CompletionStage)
     if config.prior.weights:
-        asking = any(isinstance(stage, GuidanceStage) for stage in config.stages)
-        return config, None if asking else "prior: weights were given, but no stage of this plan uses them"
+        unused = "prior: weights were given, but no stage of this plan uses them"
+        return config, None if any(map(asks_prior, config.stages)) else unused
+    distilled = any(asks_prior(stage) and isinstance(stage, OptimizeStage) for stage in config.stages)
+    if distilled:
+        config = without(config, "sds")
+    wanted = distilled or config.prior.kind != "off"
     note = (
         "prior: no diffusion; --prior-weights turns it on, with a FILE of bigs prior train "
         "or a FOLDER of Stable Diffusion"
     )
-    return _leave_out(config, GuidanceStage), None if config.prior.kind == "off" else note
+    return _leave_out(config, GuidanceStage), note if wanted else None
+
+
+def asks_prior(stage: Stage) -> bool:
+    """Whether a stage needs a diffusion model."""
+    return isinstance(stage, GuidanceStage) or (isinstance(stage, OptimizeStage) and "sds" in stage.weights)
 
 
 def _leave_out(config: RunConfig, kind: type) -> RunConfig:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from bigs.checks import InputError, check_choice
+from bigs.train.loop.optim import ONLY_FREE
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
 from bigs.train.plan.config import (
     CompletionStage,
@@ -19,6 +20,16 @@ from bigs.train.plan.config import (
     SplitStage,
     Stage,
 )
+
+# Rates of fields beside poses that move with them, where Gaussians are never freed.
+_FIELD_RATES = {
+    "hand.triplane": 1e-2,
+    "hand.appearance": 2e-3,
+    "hand.geometry": 1e-3,
+    "object.triplane": 1e-2,
+    "object.appearance": 2e-3,
+    "object.geometry": 1e-3,
+}
 
 
 @dataclass(frozen=True)
@@ -105,7 +116,8 @@ def _smooth(config: RunConfig) -> RunConfig:
 
 
 def _no_prior(config: RunConfig) -> RunConfig:
-    return replace(_keep(config, leave_out=(CompletionStage, GuidanceStage)), prior=PriorConfig())
+    less = _keep(_terms("sds")(config), leave_out=(CompletionStage, GuidanceStage))
+    return replace(less, prior=PriorConfig())
 
 
 def _object_smooth(config: RunConfig) -> RunConfig:
@@ -114,6 +126,24 @@ def _object_smooth(config: RunConfig) -> RunConfig:
 
 def _scale_search(config: RunConfig) -> RunConfig:
     return _keep(config, leave_out=ScaleSearchStage)
+
+
+def _keep_fields(config: RunConfig) -> RunConfig:
+    """Without the split: what trained free Gaussians after it trains their fields."""
+    splits = [i for i, stage in enumerate(config.stages) if isinstance(stage, SplitStage)]
+    if not splits:
+        return config
+    free = set().union(*ONLY_FREE.values())
+
+    def with_fields(stage: Stage) -> Stage:
+        if not isinstance(stage, OptimizeStage) or not free & set(stage.lrs):
+            return stage
+        subjects = {group.split(".")[0] for group in free & set(stage.lrs)}
+        fields = {name: rate for name, rate in _FIELD_RATES.items() if name.split(".")[0] in subjects}
+        return replace(stage, lrs=_less(stage.lrs, free) | fields)
+
+    before, after = config.stages[: splits[0]], config.stages[splits[0] :]
+    return _keep(replace(config, stages=(*before, *map(with_fields, after))), leave_out=SplitStage)
 
 
 def _search_labels(config: RunConfig) -> RunConfig:
@@ -213,7 +243,7 @@ _INGREDIENTS = {
     ),
     "split": Switch(
         "free Gaussians: fields stay to the end, as in the paper",
-        lambda c: _keep(c, leave_out=SplitStage),
+        _keep_fields,
     ),
     "pyramid": Switch("coarse images before fine ones", _pyramid),
     "stopping": Switch(

@@ -98,7 +98,7 @@ def _write_texts(folder: Path, clip: Path) -> None:
     for suffix in ("json", "yaml"):
         _json(folder / "manifest" / f"clips.{suffix}", document)
     (folder / "manifest" / "clips.csv").write_text(
-        "clip,name,preset,set\n../clip,first,smoke,seed=1;lighting=false\n../clip,second,smoke,\n"
+        "clip,name,preset,set\n../clip,first,smoke,seed=1;checkpoint_every=50\n../clip,second,smoke,\n"
     )
     (folder / "manifest" / "clips.txt").write_text("# two clips\n../clip\n../clip # again\n")
     truth, K = np.load(clip / "gt.npz"), load_hold(clip).K

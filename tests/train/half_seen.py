@@ -17,7 +17,7 @@ from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.raster import RasterSettings
-from bigs.train.unseen.guided import render_object
+from bigs.train.loop.virtual_views import render_object
 
 UP, FRONT = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
 

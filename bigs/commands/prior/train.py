@@ -35,7 +35,7 @@ from bigs.guidance.residual import picture_residual
 from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
 from bigs.raster.settings import RasterSettings
-from bigs.train.unseen.guided import render_object
+from bigs.train.loop.virtual_views import render_object
 
 __all__ = ["PixelConfig", "PixelTrainingConfig", "TrainedPrior", "train_prior"]
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bigs.data.base import Clip
+from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand
 from bigs.models.hand_splats import silhouette_hand
@@ -39,12 +40,14 @@ class EvidenceSource:
         scene: Scene,
         config: RunConfig,
         perceptual: VggWeights | None,
+        denoiser: Denoiser | None = None,
     ) -> None:
         self.clip = clip
         self.unknown = unknown
         self.scene = scene
         self.config = config
         self.perceptual = perceptual
+        self.denoiser = denoiser
         self.box = crop_box(clip)
         # Where the masks of hand and object meet.
         self.meeting: dict[Side, Tensor] = {
@@ -77,7 +80,13 @@ class EvidenceSource:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(
-            targets, self.touching(), silhouettes, self.config.contact, self.config.raster, self.perceptual
+            targets,
+            self.touching(),
+            silhouettes,
+            self.config.contact,
+            self.config.raster,
+            self.perceptual,
+            self.denoiser,
         )
 
     def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +33,15 @@ _ROW_PER_FRAME = ("hand.orient", "hand.pose", "object.orient")
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1])),
     "object": tuple(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL)),
+}
+# What only a subject with a field has, and what only one without has: the hand's colour is in both.
+ONLY_IN_FIELDS = {
+    "hand": {f"hand.{name}" for name in _HAND_FIELD[:-1]},
+    "object": {f"object.{name}" for name in _OBJECT_FIELD},
+}
+ONLY_FREE = {
+    "hand": {f"hand.{name}" for name in _DETAIL[:-1]},
+    "object": {f"object.{name}" for name in _DETAIL},
 }
 
 
@@ -110,13 +120,15 @@ class FrameAdam(torch.optim.Adam):
                 self.state[parameter][name][others] = rows
 
 
-def make_optimizer(scene: Scene, lrs: Mapping[str, float], frame_moments: bool = False) -> FrameAdam:
+def make_optimizer(
+    scene: Scene,
+    lrs: Mapping[str, float],
+    frame_moments: bool = False,
+    betas: tuple[float, float] = (0.9, 0.99),
+) -> FrameAdam:
     """Adam over the listed groups; everything else is set not to require a gradient.
 
-    `frame_moments` is as in `OptimizeStage`.
-
-    The second moment's decay of 0.99 suits stages of hundreds of steps, where 0.999 would still remember
-    the first.
+    `frame_moments` and `betas` are as in `OptimizeStage`.
     """
     scene.requires_grad_(False)
     groups = []
@@ -129,13 +141,20 @@ def make_optimizer(scene: Scene, lrs: Mapping[str, float], frame_moments: bool =
             groups.append(
                 {"params": parameters, "lr": lr, "start_lr": lr, "name": name, "per_frame": per_frame}
             )
-    return FrameAdam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    return FrameAdam(groups, betas=betas, eps=1e-15, fused=True)
 
 
-def set_cosine_rates(
-    optimizer: torch.optim.Optimizer, progress: float, final: float, caution: float = 1.0
+def set_rates(
+    optimizer: torch.optim.Optimizer,
+    progress: float,
+    final: float,
+    caution: float = 1.0,
+    decay: Literal["cosine", "exponential"] = "cosine",
 ) -> None:
     """Set every group's rate for `progress` in [0, 1]: `caution` times its start, down to `final` of that."""
-    factor = caution * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress)))
+    if decay == "cosine":
+        fallen = final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * progress))
+    else:
+        fallen = final**progress
     for group in optimizer.param_groups:
-        group["lr"] = group["start_lr"] * factor
+        group["lr"] = group["start_lr"] * caution * fallen

@@ -15,7 +15,7 @@ from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
 from bigs.train.loop.density import DensifyConfig, Pull, densified
-from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_cosine_rates
+from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_rates
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.terms import Term, terms_of
 from bigs.train.plan.config import OptimizeStage
@@ -119,7 +119,9 @@ def run_stage(
     terms = terms_of(stage, f"stage {stage.name}")
     if "perceptual" in stage.weights and evidence.perceptual is None:
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
-    optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments)
+    if "sds" in stage.weights and evidence.denoiser is None:
+        raise InputError(f"stage {stage.name}: expected a prior's model for the term 'sds', found none")
+    optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments, stage.adam_betas)
     state = StageState.begun(0, optimizer)
     densify = None if scene.object_splats is None else stage.densify
     if densify is not None:
@@ -150,6 +152,7 @@ def run_stage(
             labels="labels" in terms,
             seed=seed * 1_000_003 + state.step,
             free_frames=stage.free_frames,
+            progress=state.step / max(stage.steps, 1),
             pull=densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
         )
         step = Step(scene, evidence, {**fixed, **scene.canonical(moving)}, selection)
@@ -168,8 +171,7 @@ def run_stage(
             state = kept.restore(scene, optimizer)._replace(retreats=state.retreats + 1)
             warn(f"{where}; back to step {state.step} with half the rates")
             continue
-        progress = state.step / max(stage.steps, 1)
-        set_cosine_rates(optimizer, progress, stage.final_lr, 0.5**state.retreats)
+        set_rates(optimizer, selection.progress, stage.final_lr, 0.5**state.retreats, stage.decay)
         optimizer.step_frames(frames)
         state = _advance(stage, state, float(loss.detach()))
         if densify is not None:

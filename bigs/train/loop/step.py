@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
+from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.moments import Moments
@@ -30,6 +31,7 @@ class Evidence:
     contact: str  # "center" or "surface"
     settings: RasterSettings
     perceptual: VggWeights | None = None  # the network of the term "perceptual"
+    denoiser: Denoiser | None = None  # the prior of the term "sds"
 
 
 # A pixel counts as covered by an unlabelled occluder above this share.
@@ -45,6 +47,7 @@ class Selection:
     labels: bool = True  # whether the joint rendering has label channels
     seed: int = 0  # random seed of the terms
     free_frames: bool = False  # whether a hand alone is rendered where it holds nothing, not at `frames`
+    progress: float = 0.0  # share of the stage's steps that is done
     pull: bool = False  # whether `Step.object_pull` will be needed
 
 

@@ -9,6 +9,10 @@ import torch
 from torch import Tensor
 
 from bigs.checks import check_choice
+from bigs.guidance.cameras import virtual_cameras
+from bigs.guidance.denoiser import Conditions
+from bigs.guidance.schedule import SdsConfig
+from bigs.guidance.sds import sds_loss
 from bigs.losses.contact import center_contact, penetration, surface_contact
 from bigs.losses.mask import outside_mask, outside_mask_on
 from bigs.losses.perceptual import masked_perceptual
@@ -16,8 +20,12 @@ from bigs.losses.photometric import masked_ssim
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.train.loop.step import Step
+from bigs.train.loop.virtual_views import object_orbit, render_object
 from bigs.train.plan.config import OptimizeStage
 from bigs.types import Side
+
+# The paper draws one virtual camera at a time.
+_SDS_VIEWS = 1
 
 
 def _mean(values: Iterable[Tensor]) -> Tensor:
@@ -166,12 +174,35 @@ def offset(step: Step) -> Tensor:
     )
 
 
+def sds(step: Step) -> Tensor:
+    """L_SDS (paper Eq. 7) of the object, from `_SDS_VIEWS` places on a sphere around it.
+
+    Rendered at the size that the prior's encoder takes. The gradient w(t) (eps_hat - eps) dz/dI reaches
+    whatever makes the object's Gaussians. The value is for logs, see `sds_loss`.
+    """
+    canonical = step.canonical.get("object")
+    if canonical is None:
+        return torch.zeros(())
+    denoiser, generator = step.evidence.denoiser, step.generator()
+    orbit = object_orbit(canonical.means.detach(), step.clip.object)
+    directions = torch.nn.functional.normalize(torch.randn(_SDS_VIEWS, 3, generator=generator), dim=-1)
+    cameras = virtual_cameras(orbit, directions, denoiser.image_size)
+    return sds_loss(
+        denoiser,
+        render_object(canonical, cameras, denoiser.image_size, step.evidence.settings),
+        Conditions(cameras.azimuths, cameras.elevations),
+        SdsConfig(),
+        progress=step.selection.progress,
+        generator=generator,
+    )
+
+
 def smooth(step: Step) -> Tensor:
-    """The paper's L_smt: squared steps of poses and wrists from frame to frame, over the whole clip."""
+    """The paper's L_smt (Eq. 6): squared steps of fingers and wrist from frame to frame."""
 
     def one(side: Side) -> Tensor:
         pose = step.clip.canonical_hand(side)
-        return pose_steps(torch.cat([pose.global_orient[:, None], pose.hand_pose], dim=1), pose.wrist)
+        return pose_steps(pose.hand_pose, pose.wrist)
 
     return _mean(one(side) for side in step.scene.sides)
 
@@ -312,7 +343,7 @@ IMAGE_TERMS: dict[str, dict[str, Term]] = {
 
 # Terms of the canonical subjects and of the poses.
 TERMS: dict[str, Term] = {
-    **_of_gaussians(color=color, scale=scale, lbs=lbs, offset=offset),
+    **_of_gaussians(color=color, scale=scale, lbs=lbs, offset=offset, sds=sds),
     **_of_poses(
         silhouette=silhouette,  # by Gaussians of its own
         smooth=smooth,

@@ -36,8 +36,11 @@ class OptimizeStage:
     free_frames: bool = False
     # A frame that a step does not look at keeps its rotations and fingers, and their Adam moments.
     frame_moments: bool = False
-    # Learning rates fall along a cosine to this share.
+    # Learning rates fall to this share, along a cosine or by the same factor in every step.
     final_lr: float = 0.1
+    decay: Literal["cosine", "exponential"] = "cosine"
+    # Adam's. The second suits stages of hundreds of steps, where 0.999 would still remember the first.
+    adam_betas: tuple[float, float] = (0.9, 0.99)
     # Stop if the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
     stop_patience: int = 0
     stop_gain: float = 0.002

@@ -142,13 +142,6 @@ _JOINT = OptimizeStage(
         "object.ray": 0.0005,
         "scene.light": 2e-3,
         "scene.shade": 1e-2,
-        # Where fields are kept (--without split).
-        "hand.triplane": 1e-2,
-        "hand.appearance": 2e-3,
-        "hand.geometry": 1e-3,
-        "object.triplane": 1e-2,
-        "object.appearance": 2e-3,
-        "object.geometry": 1e-3,
     },
     weights={
         "image": 4.0,
@@ -306,10 +299,14 @@ SMOKE = replace(
 # the released code's rates and steps. No smoothing, no lighting, no search, no surface contact. L_vgg counts
 # when its network is given, and so does L_SDS (Eq. 7) with its prior's weights, for the object alone.
 _PAPER_IMAGE = {"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "color": 0.1, "scale": 100.0, "mask": 10.0}
+# torch's own, with which the released code trains.
+_RELEASED_BETAS = (0.9, 0.999)
+# The released offsets have no cap; a metre is one that never binds.
+_NO_CAP = 1.0
 PAPER = RunConfig(
     initial=InitialConfig(smooth_hands=0.0, smooth_object=0.0),
-    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3, shape_error=0.0),
-    object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000),
+    hand=HandSplatsConfig(triplane=TriplaneConfig(), subdivisions=3, shape_error=0.0, max_offset=_NO_CAP),
+    object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000, max_offset=_NO_CAP),
     lighting=False,
     contact="center",
     stages=(
@@ -330,6 +327,7 @@ PAPER = RunConfig(
             weights={**_PAPER_IMAGE, "smooth": 1.0, "lbs": 1000.0},
             frames_per_step=1,
             final_lr=1.0,
+            adam_betas=_RELEASED_BETAS,
         ),
         OptimizeStage(
             name="object",
@@ -343,13 +341,12 @@ PAPER = RunConfig(
                 "object.ray": 1e-4,
                 "object.depth": 1e-4,
             },
-            weights=_PAPER_IMAGE,
+            weights={**_PAPER_IMAGE, "sds": 1.0},
             frames_per_step=1,
             final_lr=1.0,
+            adam_betas=_RELEASED_BETAS,
             densify=DensifyConfig(),
         ),
-        CompletionStage(),
-        GuidanceStage(steps=1000),
         OptimizeStage(
             name="translations",
             step="interacting-subjects",
@@ -358,6 +355,8 @@ PAPER = RunConfig(
             weights={"image": 1.0, "ssim": 0.2, "perceptual": 1.0, "mask": 10.0, "contact": 1.0},
             frames_per_step=1,
             final_lr=0.01,
+            decay="exponential",
+            adam_betas=_RELEASED_BETAS,
         ),
     ),
 )

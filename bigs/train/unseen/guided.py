@@ -14,7 +14,6 @@ from torch import Tensor
 from bigs.geometry.coverage import coverage_by_direction, sphere_directions
 from bigs.guidance.cameras import (
     Orbit,
-    VirtualCameras,
     draw_directions,
     view_weights,
     virtual_cameras,
@@ -24,9 +23,9 @@ from bigs.guidance.schedule import SdsConfig
 from bigs.guidance.sds import sds_loss
 from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail
-from bigs.raster import rasterization
 from bigs.raster.settings import RasterSettings
 from bigs.train.loop.run_stage import StageState
+from bigs.train.loop.virtual_views import render_object
 from bigs.train.plan.config import GuidanceStage
 
 # Directions from which the object is viewed, before jitter.
@@ -68,26 +67,6 @@ class Guided:
     moved: Tensor  # [N, 3] metres that the Gaussians' centres moved
     worst: float  # relative growth of the largest error
     rolled_back: bool
-
-
-def render_object(
-    canonical: CanonicalObject, cameras: VirtualCameras, size: int, settings: RasterSettings
-) -> Tensor:
-    """Pictures [B, 3, size, size] of the object alone, unlit, on white."""
-    out = rasterization(
-        canonical.means,
-        canonical.quats,
-        canonical.scales,
-        canonical.opacities,
-        canonical.colors,
-        cameras.viewmats,
-        cameras.K.expand(len(cameras.viewmats), 3, 3),
-        size,
-        size,
-        settings=settings,
-        backgrounds=torch.ones(len(cameras.viewmats), 3),
-    )
-    return out.colors.permute(0, 3, 1, 2)
 
 
 def guide_object(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bigs.guidance.cameras import Orbit, make_orbit, virtual_cameras
+from bigs.guidance.cameras import Orbit, virtual_cameras
 from bigs.guidance.denoiser import Conditions, Denoiser
 from bigs.guidance.residual import picture_residual
 from bigs.models.canonical import CanonicalObject
@@ -16,6 +16,7 @@ from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.raster.settings import RasterSettings
 from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.virtual_views import object_orbit, render_object
 from bigs.train.plan.config import GuidanceStage
 from bigs.train.unseen.completed_scene import CompletedScene
 from bigs.train.unseen.guided import (
@@ -25,7 +26,6 @@ from bigs.train.unseen.guided import (
     coverage_of,
     follow,
     guide_object,
-    render_object,
 )
 from bigs.train.unseen.seen import (
     SHOWS,
@@ -47,18 +47,12 @@ _HOLDING_FRAMES = 60
 
 @torch.no_grad()
 def scene_coverage(scene: Scene, evidence: Evidence) -> tuple[Coverage, Orbit]:
-    """How much of the object's Gaussians the clip has seen, and the sphere from which the rest is looked at.
-
-    The front is where the clip's camera stood on average, and up is what was up in its pictures.
-    """
+    """How much of the object the clip has seen, and the sphere from which the rest is looked at."""
     canonical = scene.object_splats()
     frames = frames_seen(canonical, object_views(scene, evidence))
     seen = torch.as_tensor(frames >= min(_LEAST_FRAMES, scene.n_frames))
     pose = scene.at(torch.arange(scene.n_frames)).object
-    up = -pose.rotations[:, 1].mean(0)
-    towards = -(pose.rotations.transpose(-1, -2) @ pose.centers[..., None])[..., 0]
-    front = torch.nn.functional.normalize(towards, dim=-1).mean(0)
-    return coverage_of(canonical.normals, seen), make_orbit(canonical.means, up, front)
+    return coverage_of(canonical.normals, seen), object_orbit(canonical.means, pose)
 
 
 def guide_scene(

@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from toy_denoisers import LinearDenoiser
 from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
 
+from bigs.checks import InputError
 from bigs.hand import HandModel
 from bigs.losses.mask import label_difference, outside_mask, spilled
 from bigs.losses.photometric import masked_l1, masked_mse
@@ -293,8 +295,46 @@ def test_the_hook_sees_every_step(scene: Scene, evidence: Evidence) -> None:
 # --- what terms say ---
 
 
+def test_score_distillation_reaches_the_objects_field(scene: Scene, evidence: Evidence) -> None:
+    """Rendered at the size of the prior's encoder; the hands' fields get nothing of it."""
+    sizes: list[tuple[int, ...]] = []
+
+    class Prior(LinearDenoiser):
+        def encode(self, images: Tensor) -> Tensor:
+            sizes.append(tuple(images.shape))
+            return super().encode(images)
+
+    evidence = replace(evidence, denoiser=Prior(24, dtype=torch.float32))
+    lrs = {"object.triplane": 1e-2, "object.appearance": 1e-2, "object.geometry": 1e-2, "hand.triplane": 1e-2}
+    stage = replace(ALONE, steps=2, lrs=lrs, weights={"sds": 1.0})
+    before = values(scene)
+    run_stage(scene, stage, evidence, 0)
+    assert sizes == [(1, 3, 24, 24)] * 2
+    after = values(scene)
+    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert moved == {"object_splats"}
+    with pytest.raises(InputError, match="expected a prior's model for the term 'sds', found none"):
+        run_stage(scene, stage, replace(evidence, denoiser=None), 0)
+
+
+def test_the_papers_smoothness_is_of_fingers_and_wrist_alone(scene: Scene, evidence: Evidence) -> None:
+    step = Step(scene, evidence, {}, Selection(torch.arange(scene.n_frames)))
+    still = TERMS["smooth"](step)
+    with torch.no_grad():
+        for poses in scene.hand_poses.values():
+            poses.orient[1] = 0.5
+    step = Step(scene, evidence, {}, Selection(torch.arange(scene.n_frames)))
+    assert TERMS["smooth"](step) == still
+    with torch.no_grad():
+        for poses in scene.hand_poses.values():
+            poses.pose[1] = 0.5
+    step = Step(scene, evidence, {}, Selection(torch.arange(scene.n_frames)))
+    assert TERMS["smooth"](step) > still + 1.0
+
+
 def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None:
     """On an ordinary scene, each term alone can be asked for and can be differentiated."""
+    evidence = replace(evidence, denoiser=LinearDenoiser(24, dtype=torch.float32))
     for step, image_terms in IMAGE_TERMS.items():
         for name in (*image_terms, *TERMS):
             lrs = {group: 1e-4 for group in GROUPS}

@@ -14,7 +14,7 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
-from bigs.train.loop.optim import FIELD_GROUPS, GROUPS, group_parameters, make_optimizer, set_cosine_rates
+from bigs.train.loop.optim import FIELD_GROUPS, GROUPS, group_parameters, make_optimizer, set_rates
 from bigs.train.plan.presets import SMOKE
 from bigs.train.start.build import build_scene
 from bigs.types import Side
@@ -76,9 +76,18 @@ def test_only_listed_groups_require_gradients(both_hands: dict[Side, HandModel])
 def test_rates_fall_along_a_cosine(both_hands: dict[Side, HandModel]) -> None:
     optimizer = make_optimizer(cube_scene(both_hands), {"hand.ray": 0.5, "hand.depth": 2.0})
     for progress, share in ((0.0, 1.0), (0.5, 0.55), (0.25, 0.1 + 0.45 * (1 + math.sqrt(0.5))), (1.0, 0.1)):
-        set_cosine_rates(optimizer, progress, 0.1)
+        set_rates(optimizer, progress, 0.1)
         rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
         assert rates == pytest.approx({"hand.ray": 0.5 * share, "hand.depth": 2.0 * share})
+
+
+def test_rates_fall_by_the_same_factor(both_hands: dict[Side, HandModel]) -> None:
+    """The released code's schedule of translations: 2e-3 to 2e-5, log-linear."""
+    optimizer = make_optimizer(cube_scene(both_hands), {"hand.ray": 2e-3}, betas=(0.9, 0.999))
+    assert optimizer.param_groups[0]["betas"] == (0.9, 0.999)
+    for progress, rate in ((0.0, 2e-3), (0.5, 2e-4), (1.0, 2e-5)):
+        set_rates(optimizer, progress, 0.01, decay="exponential")
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
 
 
 def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side, HandModel]) -> None:
