@@ -10,10 +10,12 @@ from bigs.raster.settings import RasterSettings
 __all__ = [
     "RasterState",
     "__version__",
+    "cut_patches",
     "default_settings",
     "fma_peak_gflops",
     "harmonics_backward",
     "harmonics_forward",
+    "lay_patches",
     "pose_backward",
     "pose_forward",
     "rasterize_backward",
@@ -165,6 +167,26 @@ def terms_alone_backward(
     arrays: tuple[NDArray[Any] | None, ...], frames: tuple[int, ...], area: float, v: list[float]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Flat gradients of colors, empty where there are none, and of alphas from those of the terms."""
+
+def cut_patches(
+    picture: NDArray[np.float32], places: NDArray[np.float32], half: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Flat grey values, slopes and weights of patches about places [N, 2] of a picture [2, H, W]."""
+
+def lay_patches(
+    picture: NDArray[np.float32],
+    templates: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    starts: NDArray[np.float32],
+    warps: NDArray[np.float32],
+    half: int,
+    iterations: int,
+    limits: tuple[float, float, float, float],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Flat places at which patches come to lie on a picture [2, H, W], and which fit.
+
+    Templates are grey values [N, S], slopes [N, S, 2] and weights [N, S]; starts [N, 2], warps [N, 2, 2].
+    `limits` are the least share shown, the least likeness, the most moved and the most unsure, in pixels.
+    """
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

@@ -55,7 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "data": BELOW | {"geometry", "colmap"},
     "metrics": BELOW | {"geometry"},
     "export": BELOW | {"geometry"},
-    "motion": BELOW | {"geometry", "colmap"},
+    "motion": BELOW | {"geometry", "colmap", "_raster"},
     "preprocess": BELOW | {"geometry", "hand", "data", "colmap", "motion"},
     "viewer": {"types", "checks", "atomic"},
     "models": BELOW | {"geometry", "fused", "hand", "fields"},

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.spatial
-import torch
 
 from bigs.motion.features import FrameFeatures
-from bigs.motion.patches import Laid, PatchConfig, Pictures, cut_templates, lay, patch_offsets
+from bigs.motion.patches import Laid, PatchConfig, Pictures, cut_templates, lay
 
 
 @dataclass(frozen=True)
@@ -127,11 +126,10 @@ def _followed(
     patch: PatchConfig,
 ) -> Laid:
     """Patches about pixels `start` [n, 2] of the first frame, from pixels `guess` on in the second."""
-    offsets = patch_offsets(patch)
-    warp = torch.eye(2).expand(len(start), 2, 2)
+    warp = np.tile(np.eye(2), (len(start), 1, 1))
     own = np.full(len(start), frames[0])
     for pictures in levels:
-        templates = cut_templates(pictures, own, start, offsets, patch)
+        templates = cut_templates(pictures, own, start, patch)
         laid = lay(pictures, frames[1], guess, warp, templates, patch)
         guess = laid.pixels
     return laid

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-import torch
 from PIL import Image
 
+from bigs import _raster
 from bigs.geometry.surface import point_normals
 from bigs.motion.features import crop_box
 from bigs.motion.object_map import ObjectMap
@@ -111,34 +111,27 @@ class Pictures:
             grey = Image.fromarray(image[top:bottom, left:right]).convert("L").reduce(self.shrunk)
             on = Image.fromarray(mask[top:bottom, left:right].astype(np.uint8) * 255).reduce(self.shrunk)
             smooth = scipy.ndimage.gaussian_filter(np.asarray(grey, dtype=np.float32), config.blur)
-            crop = np.stack([smooth, np.asarray(on, dtype=np.float32) / 255.0])
-            self._crops.append(torch.from_numpy(crop))
+            self._crops.append(np.stack([smooth, np.asarray(on, dtype=np.float32) / np.float32(255.0)]))
 
-    def sample(self, t: int, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Grey values and shares of object [B, S] at places [B, S, 2] of frame `t`, see `places`."""
-        crop = self._crops[t]
-        size = places.new_tensor([crop.shape[2], crop.shape[1]])
-        grey, on = torch.nn.functional.grid_sample(
-            crop[None], (2.0 * places / size - 1.0)[None], align_corners=False, padding_mode="border"
-        )[0]
-        inside = ((places > 0) & (places < size)).all(-1)
-        return grey, on * inside
+    def __getitem__(self, t: int) -> np.ndarray:
+        """Grey values and shares of object [2, h, w] of frame `t`."""
+        return self._crops[t]
 
-    def places(self, frames: np.ndarray | int, pixels: np.ndarray) -> torch.Tensor:
+    def places(self, frames: np.ndarray | int, pixels: np.ndarray) -> np.ndarray:
         """Pixels [N, 2] of the clip's images as places in the frames' crops."""
-        return torch.from_numpy((pixels - self.corners[frames]) / self.shrunk).float()
+        return ((pixels - self.corners[frames]) / self.shrunk).astype(np.float32)
 
-    def pixels(self, t: int, places: torch.Tensor) -> np.ndarray:
+    def pixels(self, t: int, places: np.ndarray) -> np.ndarray:
         """The inverse of `places`."""
-        return self.shrunk * places.double().numpy() + self.corners[t]
+        return self.shrunk * places.astype(np.float64) + self.corners[t]
 
 
 class Templates(NamedTuple):
     """Patches as their own frames show them."""
 
-    grey: torch.Tensor  # [N, S]
-    slope: torch.Tensor  # [N, S, 2] by column and row
-    weight: torch.Tensor  # [N, S], 0 off the object
+    grey: np.ndarray  # [N, S]
+    slope: np.ndarray  # [N, S, 2] by column and row
+    weight: np.ndarray  # [N, S], 0 off the object
 
 
 def _measured(
@@ -162,9 +155,8 @@ def _measured(
     order = np.lexsort((facing, point))
     frontal = order[np.append(np.flatnonzero(np.diff(point[order])), len(order) - 1)]
     own, middle = frame[frontal], pixels[frontal]
-    offsets = patch_offsets(config)
-    templates = cut_templates(pictures, own, middle, offsets, config)
-    whole = (templates.weight > 0).float().mean(1).numpy() > config.least_shown
+    templates = cut_templates(pictures, own, middle, config)
+    whole = (templates.weight > 0).mean(1) > config.least_shown
     whole &= facing[frontal] > config.least_cosine
 
     found = []
@@ -182,38 +174,21 @@ def _measured(
     return Sightings(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
-def patch_offsets(config: PatchConfig) -> torch.Tensor:
-    """Places of a patch about its middle [S, 2]."""
-    line = torch.arange(-config.half, config.half + 1, dtype=torch.float32)
-    row, column = torch.meshgrid(line, line, indexing="ij")
-    return torch.stack([column.ravel(), row.ravel()], dim=1)
-
-
-def cut_templates(
-    pictures: Pictures, own: np.ndarray, middle: np.ndarray, offsets: torch.Tensor, config: PatchConfig
-) -> Templates:
+def cut_templates(pictures: Pictures, own: np.ndarray, middle: np.ndarray, config: PatchConfig) -> Templates:
     """The patches of points at pixels `middle` [N, 2] of their frames `own` [N]."""
-    shape = (len(own), len(offsets))
-    grey, slope, weight = torch.zeros(shape), torch.zeros(*shape, 2), torch.zeros(shape)
-    bell = torch.exp(-0.5 * (offsets**2).sum(1) / (0.6 * config.half) ** 2)
-    half_pixel = 0.5 * torch.eye(2)
+    shape = (len(own), (2 * config.half + 1) ** 2)
+    found = Templates(*(np.empty((*shape, *last), dtype=np.float32) for last in ((), (2,), ())))
     for t in np.unique(own):
         rows = np.flatnonzero(own == t)
-        places = pictures.places(int(t), middle[rows])[:, None] + offsets
-        grey[rows], on = pictures.sample(int(t), places)
-        weight[rows] = bell * (on > 0.99)
-        for axis, step in enumerate(half_pixel):
-            ahead, behind = (
-                pictures.sample(int(t), places + step)[0],
-                pictures.sample(int(t), places - step)[0],
-            )
-            slope[rows, :, axis] = ahead - behind
-    return Templates(grey, slope, weight)
+        cut = _raster.cut_patches(pictures[t], pictures.places(t, middle[rows]), config.half)
+        for whole, part in zip(found, cut, strict=True):
+            whole[rows] = part.reshape(len(rows), *whole.shape[1:])
+    return found
 
 
 def _warps(
     map_: ObjectMap, t: int, own: np.ndarray, points: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, torch.Tensor]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Where points on planes show in frame `t` [N, 2], and how pixels of their own frames turn [N, 2, 2]."""
     K, rotation, transl = map_.K, map_.rotations[own], map_.transl[own]
     focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
@@ -231,7 +206,7 @@ def _warps(
         ray = np.concatenate([middle + step / focal, np.ones((len(own), 1))], axis=1)
         on_plane = ray * (height / (normal * ray).sum(1))[:, None]
         warp[:, :, axis] = project(np.einsum("nji,nj->ni", rotation, on_plane - transl)) - start
-    return start, torch.from_numpy(warp).float()
+    return start, warp
 
 
 class Laid(NamedTuple):
@@ -245,50 +220,21 @@ def lay(
     pictures: Pictures,
     t: int,
     start: np.ndarray,
-    warp: torch.Tensor,
+    warp: np.ndarray,
     templates: Templates,
     config: PatchConfig,
 ) -> Laid:
-    """Lay patches on frame `t`, from pixels `start` [N, 2] on.
+    """Lay patches on frame `t`, from pixels `start` [N, 2] on, each turned by its `warp` [N, 2, 2].
 
-    Gauss-Newton on the shift alone, with the template's slopes (inverse compositional); both sides are
-    brought to mean 0 and deviation 1, since light changes as the object turns.
+    The engine moves each to where it fits best, and says whether it was recognised there.
     """
-    places = began = pictures.places(t, start)
-    spread = torch.einsum("nij,sj->nsi", warp, patch_offsets(config))
-    on = pictures.sample(t, places[:, None] + spread)[1] > 0.5
-    full = templates.weight.sum(1).clamp_min(1e-9)
-    weight = templates.weight * on
-    shown = weight.sum(1) / full
-    weight = (weight + 1e-9) / (weight + 1e-9).sum(1, keepdim=True)
-    wanted, deviation = _standardised(templates.grey, weight)
-    slope = templates.slope / deviation[..., None]
-    slope = slope - (weight[..., None] * slope).sum(1, keepdim=True)
-    normal = torch.einsum("ns,nsi,nsj->nij", weight, slope, slope)
-    # An edge or a uniform patch leaves a direction open; there the map's prediction stands.
-    size = normal.diagonal(dim1=1, dim2=2).sum(1)
-    inverse = torch.linalg.inv(normal + (1e-3 * size + 1e-9)[:, None, None] * torch.eye(2))
-    for _ in range(config.iterations):
-        seen, _ = _standardised(pictures.sample(t, places[:, None] + spread)[0], weight)
-        pull = torch.einsum("ns,nsi,ns->ni", weight, slope, seen - wanted)
-        step = torch.einsum("nij,nj->ni", inverse, pull).clamp(-1.5, 1.5)
-        places = places - torch.einsum("nij,nj->ni", warp, step)
-    seen, _ = _standardised(pictures.sample(t, places[:, None] + spread)[0], weight)
-    likeness = (weight * seen * wanted).sum(1)
-    fits = (
-        (likeness > config.likeness)
-        & ((places - began).norm(dim=1) < config.most_moved)
-        & (shown > config.least_shown)
+    places, fits = _raster.lay_patches(
+        pictures[t],
+        templates,
+        pictures.places(t, start),
+        warp.astype(np.float32),
+        config.half,
+        config.iterations,
+        (config.least_shown, config.likeness, config.most_moved, config.most_unsure / pictures.shrunk),
     )
-    # Differences count as noise.
-    noise = (2.0 * (1.0 - likeness)).clamp_min(1e-6) * (weight**2).sum(1)
-    sigma = (noise / torch.linalg.eigvalsh(normal)[:, 0].clamp_min(1e-9)).sqrt()
-    fits &= pictures.shrunk * sigma < config.most_unsure
-    return Laid(pictures.pixels(t, places), fits.numpy())
-
-
-def _standardised(grey: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values [N, S] less their weighted mean over their deviation, and that deviation [N, 1]."""
-    centred = grey - (weight * grey).sum(1, keepdim=True)
-    deviation = (weight * centred**2).sum(1, keepdim=True).sqrt().clamp_min(1e-3)
-    return centred / deviation, deviation
+    return Laid(pictures.pixels(t, places.reshape(-1, 2)), fits)

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from filmed_egg import WIDTH, film
+from patch_twin import cut_twin, lay_twin
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
 from bigs.motion.object_map import MapConfig, ObjectMap
-from bigs.motion.patches import PatchConfig, Pictures, sharpen
+from bigs.motion.patches import PatchConfig, Pictures, cut_templates, lay, sharpen
 
 
 class Filmed(NamedTuple):
@@ -106,3 +107,25 @@ def test_frames_without_the_object_are_no_hindrance(filmed: Filmed) -> None:
     sharpen(found, Pictures(filmed.images, masks, PatchConfig()), PatchConfig())
     assert not (found.use() & (found.frame == 5)).any()
     assert np.isfinite(found.transl).all()
+
+
+@pytest.mark.parametrize(("coarser", "half", "turned"), [(1, 4, True), (1, 6, False), (2, 6, False)])
+def test_the_engine_does_what_its_twin_does(filmed: Filmed, coarser: int, half: int, turned: bool) -> None:
+    config = PatchConfig(half=half, most_unsure=0.4)
+    pictures = Pictures(filmed.images, filmed.masks, config, coarser)
+    rng = np.random.default_rng(half)
+    pixels = rng.permutation(np.argwhere(filmed.masks[7])[:, ::-1])[:300] + rng.uniform(size=(300, 2))
+    warp = np.tile(np.eye(2), (300, 1, 1)) + turned * rng.normal(0.0, 0.15, (300, 2, 2))
+    start = pixels + rng.normal(0.0, 1.0, (300, 2))
+    templates = cut_templates(pictures, np.full(300, 7), pixels, config)
+    wanted = cut_twin(pictures, 7, pixels, config)
+    for name, part, twin in zip(templates._fields, templates, wanted, strict=True):
+        assert np.allclose(part, twin, atol=3e-3), name
+    laid = lay(pictures, 8, start, warp, templates, config)
+    twin, likeness = lay_twin(pictures, 8, start, warp, wanted, config)
+    assert 50 < twin.fits.sum() < 300
+    # Where rounding decides nothing, both decide alike.
+    plain = np.abs(likeness - config.likeness) > 1e-3
+    assert (laid.fits != twin.fits)[plain].sum() <= 2
+    both = laid.fits & twin.fits
+    assert np.abs(laid.pixels - twin.pixels)[both].max() < 5e-3 * coarser

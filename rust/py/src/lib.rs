@@ -5,6 +5,7 @@ mod measure;
 mod pixels;
 mod pose;
 mod sh;
+mod track;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -325,6 +326,8 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(pixels::terms_together_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(track::cut_patches, m)?)?;
+    m.add_function(wrap_pyfunction!(track::lay_patches, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
     m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }

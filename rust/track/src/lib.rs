@@ -1,0 +1,30 @@
+//! Patches of one picture found again in another, to fractions of a pixel: [`cut`] takes them out of their own picture,
+//! [`lay`] moves them over another one to where they fit best.
+//!
+//! A patch is a square of samples about its middle. Places are in pixels of the picture, column first; the first pixel's
+//! middle is at (0.5, 0.5), and beyond the border the border goes on. Patches are shared among rayon's threads and do
+//! not see each other, so the number of threads changes no bit. Nothing panics on values; a place that is no number
+//! fits nowhere.
+
+#![forbid(unsafe_code)]
+#![cfg_attr(
+    not(test),
+    warn(
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::todo,
+        clippy::unimplemented
+    )
+)]
+
+mod cut;
+mod error;
+mod lay;
+mod picture;
+mod sums;
+
+pub use cut::{Cut, Templates, cut};
+pub use error::TrackError;
+pub use lay::{Laid, Laying, lay};
+pub use picture::Picture;
