@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from trimesh.registration import icp
 
 from bigs.checks import check_shape
 from bigs.metrics.shape import MAX_POINTS, Chamfer, ShapeScore, chamfer, draw, shape_score
@@ -98,13 +98,13 @@ def similarity_icp(
     coarse_target = (target_samples - target_centre) / target_radius
     fine_source = (draw(source_scored, _FINE_POINTS, generator) - source_centre) / source_radius
     fine_target = (draw(target_scored, _FINE_POINTS, generator) - target_centre) / target_radius
-    coarse = [
-        _icp(coarse_source, coarse_target, start, _COARSE_ITERATIONS)
-        for start in Rotation.create_group("I").as_matrix()
-    ]
-    coarse.sort(key=lambda unit: _squared_chamfer(coarse_source, coarse_target, unit))
-    fine = [_icp(fine_source, fine_target, unit, _FINE_ITERATIONS) for unit in coarse[:_FINE_STARTS]]
-    return min(map(to_metres, coarse[:_FINE_STARTS] + fine), key=lambda fit: fit.score.chamfer.squared)
+    starts = np.tile(np.eye(4), (60, 1, 1))
+    starts[:, :3, :3] = Rotation.create_group("I").as_matrix()
+    coarse = _icp(coarse_source, coarse_target, starts, _COARSE_ITERATIONS)
+    costs = [_squared_chamfer(coarse_source, coarse_target, unit) for unit in coarse]
+    best = coarse[np.argsort(costs, kind="stable")[:_FINE_STARTS]]
+    fine = _icp(fine_source, fine_target, best, _FINE_ITERATIONS)
+    return min(map(to_metres, [*best, *fine]), key=lambda fit: fit.score.chamfer.squared)
 
 
 def _sample(verts: np.ndarray, faces: np.ndarray | None, generator: torch.Generator, seed: int) -> np.ndarray:
@@ -115,20 +115,45 @@ def _sample(verts: np.ndarray, faces: np.ndarray | None, generator: torch.Genera
     return np.asarray(samples, dtype=np.float64)
 
 
-def _icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
-    """The similarity [4, 4] that ICP reaches from `start`, a rotation [3, 3] or a similarity [4, 4]."""
-    initial = np.eye(4)
-    initial[: len(start), : len(start)] = start
-    fitted, _, _ = icp(
-        source,
-        target,
-        initial=initial,
-        threshold=_TOLERANCE,
-        max_iterations=iterations,
-        reflection=False,
-        scale=True,
-    )
-    return fitted
+def _icp(source: np.ndarray, target: np.ndarray, starts: np.ndarray, iterations: int) -> np.ndarray:
+    """The similarities [S, 4, 4] that ICP reaches from `starts` [S, 4, 4], side by side.
+
+    A start rests once a round lowers its mean squared distance by less than `_TOLERANCE`.
+    """
+    tree = cKDTree(target)
+    found, costs = starts.copy(), np.full(len(starts), np.inf)
+    active = np.arange(len(starts))
+    for _ in range(iterations):
+        rotation, translation = found[active, :3, :3], found[active, None, :3, 3]
+        moved = source @ rotation.transpose(0, 2, 1) + translation
+        nearest = target[tree.query(moved, workers=-1)[1]]
+        step = _procrustes(moved, nearest)
+        found[active] = step @ found[active]
+        moved = moved @ step[:, :3, :3].transpose(0, 2, 1) + step[:, None, :3, 3]
+        cost = ((nearest - moved) ** 2).sum(-1).mean(-1)
+        going = costs[active] - cost >= _TOLERANCE
+        costs[active] = cost
+        active = active[going]
+        if len(active) == 0:
+            break
+    return found
+
+
+def _procrustes(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Similarities [S, 4, 4] that lay each of `source` [S, N, 3] on `target` [S, N, 3], point by point.
+
+    The scale brings one spread to the other, so that it does not shrink where the two agree badly.
+    """
+    source_centre, target_centre = source.mean(1, keepdims=True), target.mean(1, keepdims=True)
+    source, target = source - source_centre, target - target_centre
+    u, _, vt = np.linalg.svd(target.transpose(0, 2, 1) @ source)
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    rotation = u @ vt
+    scale = np.sqrt((target**2).sum((1, 2)) / (source**2).sum((1, 2)))
+    found = np.tile(np.eye(4), (len(source), 1, 1))
+    found[:, :3, :3] = scale[:, None, None] * rotation
+    found[:, :3, 3] = target_centre[:, 0] - (found[:, :3, :3] @ source_centre.transpose(0, 2, 1))[..., 0]
+    return found
 
 
 def _squared_chamfer(source: np.ndarray, target: np.ndarray, similarity: np.ndarray) -> float:
