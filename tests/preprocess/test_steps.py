@@ -158,7 +158,7 @@ def test_what_another_tool_supplied_is_kept_and_said(copied: Path, given: Given)
 def test_somebody_elses_build_folder_is_not_touched(copied: Path, given: Given) -> None:
     (copied / "processed" / "build.json").unlink()
     before = (copied / "build" / "data.npy").read_bytes()
-    with pytest.raises(InputError, match="found another's"):
+    with pytest.raises(InputError, match="found another;"):
         preprocess(request_of(given, copied), ("build",))
     assert (copied / "build" / "data.npy").read_bytes() == before
 
