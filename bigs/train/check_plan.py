@@ -31,18 +31,18 @@ def check_plan(config: RunConfig) -> None:
     """
     names = [stage.name for stage in config.stages]
     if not names:
-        raise InputError("config stages: expected at least one stage, found none")
+        raise InputError("config.stages: expected at least one stage, found none")
     repeated = {name for name in names if names.count(name) > 1}
     if repeated:
-        raise InputError(f"config stages: expected unique names, found {sorted(repeated)[0]!r} twice")
+        raise InputError(f"config.stages: expected unique names, found {sorted(repeated)[0]!r} twice")
     check_ranges("config", config)
     for earlier, stage in pairwise(config.stages):
         if isinstance(stage, ObjectMotionStage):
             raise InputError(
-                f"config stages.{stage.name}: expected this stage first, found it after {earlier.name}"
+                f"config.stages.{stage.name}: expected this stage first, found it after {earlier.name}"
             )
     for stage in config.stages:
-        where = f"config stages.{stage.name}"
+        where = f"config.stages.{stage.name}"
         if isinstance(stage, OptimizeStage):
             _check_names(where, stage)
             for name, given in (("free_frames", stage.free_frames), ("densify", stage.densify is not None)):
@@ -55,7 +55,7 @@ def check_plan(config: RunConfig) -> None:
         value = getattr(config.raster, name)
         if value not in (*others, last):
             known = ", ".join(map(str, others))
-            raise InputError(f"config raster.{name}: expected {known} or {last}, found {value}")
+            raise InputError(f"config.raster.{name}: expected {known} or {last}, found {value}")
 
 
 def _check_names(where: str, stage: OptimizeStage) -> None:
@@ -74,10 +74,10 @@ def _check_parameters(config: RunConfig) -> None:
             return  # whether the object leaves its field there depends on the clip
         elif isinstance(stage, OptimizeStage):
             for group in stage.lrs:
-                _check_group(f"config stages.{stage.name}.lrs", group, freed.get(group.split(".")[0]))
+                _check_group(f"config.stages.{stage.name}.lrs", group, freed.get(group.split(".")[0]))
                 if group.startswith("scene.") and not config.lighting:
                     raise InputError(
-                        f"config stages.{stage.name}.lrs: expected {group} with lighting, found lighting off "
+                        f"config.stages.{stage.name}.lrs: expected {group} with lighting, found lighting off "
                         "(--without lighting leaves out both)"
                     )
 
