@@ -178,7 +178,6 @@ impl<'a, T: Scalar> Stages<'a, T> {
             &self.view.camera,
             &self.limits,
             &self.projected,
-            &self.lists,
             channels,
             self.gradients.intersections.written(),
             grads.slices(),
@@ -195,9 +194,9 @@ impl<'a, T: Scalar> Stages<'a, T> {
             limits.min_transmittance.as_f64(),
         );
         let (lists, size) = (&*self.lists, self.grid.tile_size);
-        let in_pixel = |gaussians: &[u32], column: usize, row: usize| {
+        let in_pixel = |entries: &[[u32; 2]], column: usize, row: usize| {
             let (mut pairs, mut transmittance) = (0, 1.0);
-            for &gaussian in gaussians {
+            for &[gaussian, _] in entries {
                 let splat = &self.projected.splats[gaussian as usize];
                 let dx = column as f64 + 0.5 - splat.x.as_f64();
                 let dy = row as f64 + 0.5 - splat.y.as_f64();
@@ -218,14 +217,13 @@ impl<'a, T: Scalar> Stages<'a, T> {
         (0..self.grid.len())
             .into_par_iter()
             .map(|tile| {
-                let gaussians =
-                    &lists.gaussians[lists.offsets[tile] as usize..lists.offsets[tile + 1] as usize];
+                let entries = &lists.entries[lists.offsets[tile] as usize..lists.offsets[tile + 1] as usize];
                 let (left, top) = self.grid.origin(tile);
                 let rows = top..(top + size).min(self.grid.height);
                 rows.map(|row| {
                     let columns = left..(left + size).min(self.grid.width);
                     columns
-                        .map(|column| in_pixel(gaussians, column, row))
+                        .map(|column| in_pixel(entries, column, row))
                         .sum::<usize>()
                 })
                 .sum::<usize>()

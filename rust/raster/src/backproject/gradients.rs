@@ -8,7 +8,6 @@ use crate::composite::kernel::Channels;
 use crate::input::camera::Camera;
 use crate::input::gaussians::Gaussians;
 use crate::input::settings::Limits;
-use crate::lists::tile_lists::TileLists;
 use crate::math::real::Real;
 use crate::project::packet::{PACKET_SIZE, PacketGradients};
 use crate::project::projected::Projected;
@@ -45,7 +44,6 @@ pub(crate) fn project_view_vjp<T: Real>(
     camera: &Camera<T>,
     limits: &Limits<T>,
     projected: &Projected<T>,
-    lists: &TileLists,
     channels: Channels<'_, T>,
     intersections: &[T],
     out: ViewGradients<'_, T>,
@@ -84,7 +82,6 @@ pub(crate) fn project_view_vjp<T: Real>(
                     values: intersections,
                     channels,
                     absolute,
-                    positions: &lists.positions,
                     cover,
                     splats: &projected.splats[first..first + cover.len()],
                 };

@@ -1,15 +1,13 @@
 //! From the gradients of intersections to those of splats: sums in the order of the tiles.
 
+use std::ops::Range;
+
 use crate::composite::intersection_gradients::gradient_size;
 use crate::composite::kernel::{ABSOLUTES, Channels, LANES, MOMENTS};
 use crate::math::real::Real;
 use crate::project::packet::{PacketGradients, is_sound};
 use crate::project::splat::Splat;
 use crate::project::tiles::Cover;
-use crate::simd::prefetch;
-
-/// IntersectionGradients that are asked for ahead of the one being summed.
-const AHEAD: usize = 16;
 
 /// The gradients of the intersections of a packet of Gaussians.
 pub(crate) struct PacketIntersections<'a, T> {
@@ -17,8 +15,6 @@ pub(crate) struct PacketIntersections<'a, T> {
     pub(crate) values: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) absolute: bool,
-    /// Of all packets: see [`crate::lists::tile_lists::TileLists::positions`].
-    pub(crate) positions: &'a [u32],
     pub(crate) cover: &'a Cover,
     pub(crate) splats: &'a [Splat<T>],
 }
@@ -41,13 +37,13 @@ struct Sums<T> {
 }
 
 impl<T: Real> PacketIntersections<'_, T> {
-    /// Sums values `first..first + LANES` of the gradients at these positions; values beyond a gradient's size are of no
+    /// Sums values `first..first + LANES` of the gradients with these numbers; values beyond a gradient's size are of no
     /// meaning.
     #[inline(always)]
-    fn vector(&self, positions: &[u32], size: usize, first: usize) -> [T; LANES] {
+    fn vector(&self, own: Range<usize>, size: usize, first: usize) -> [T; LANES] {
         let mut sum = [T::ZERO; LANES];
-        for &position in positions {
-            let values = &self.values[position as usize * size + first..][..LANES];
+        for number in own {
+            let values = &self.values[number * size + first..][..LANES];
             for k in 0..LANES {
                 sum[k] += values[k];
             }
@@ -57,9 +53,9 @@ impl<T: Real> PacketIntersections<'_, T> {
 
     /// Sums the gradients of one Gaussian's intersections; writes the gradients of its colours to `colors` (none if empty).
     #[inline(always)]
-    fn sums(&self, positions: &[u32], size: usize, colors: &mut [T]) -> Sums<T> {
+    fn sums(&self, own: Range<usize>, size: usize, colors: &mut [T]) -> Sums<T> {
         let Channels { total, colored, .. } = self.channels;
-        let values = self.vector(positions, size, 0);
+        let values = self.vector(own.clone(), size, 0);
         let mut sums = Sums {
             moments: std::array::from_fn(|k| values[k]),
             depth: T::ZERO,
@@ -73,7 +69,7 @@ impl<T: Real> PacketIntersections<'_, T> {
             return sums;
         }
         for first in (0..size).step_by(LANES) {
-            let values = self.vector(positions, size, first);
+            let values = self.vector(own.clone(), size, first);
             for (place, &value) in (first..size).zip(&values) {
                 let Some(channel) = place.checked_sub(MOMENTS) else {
                     continue;
@@ -121,18 +117,12 @@ pub(crate) fn sum_packet<T: Real>(
         if own.is_empty() {
             continue;
         }
-        // IntersectionGradients lie tile by tile: one Gaussian's, and the next one's, are far apart.
-        let ahead = (own.start + AHEAD).min(from.positions.len());
-        for &position in &from.positions[ahead..(ahead + own.len()).min(from.positions.len())] {
-            prefetch(from.values, position as usize * size);
-            prefetch(from.values, position as usize * size + size - 1);
-        }
         let colors = if out.colors.is_empty() {
             &mut []
         } else {
             &mut out.colors[local * stride..][..colored]
         };
-        let sums = from.sums(&from.positions[own], size, colors);
+        let sums = from.sums(own, size, colors);
         let (splat, [h, mut hu, mut hv, huu, huv, hvv]) = (&from.splats[local], sums.moments);
         if let Some(v) = out.absgrad.get_mut(local) {
             let [x, y] = sums.absolutes;

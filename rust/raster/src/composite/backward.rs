@@ -1,11 +1,12 @@
 //! The vjp of `composite`: from the gradient of an image to one of each splat in each tile.
+#![allow(unsafe_code)]
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
 use crate::composite::dispatch;
-use crate::composite::forward::{Canvas, LEAST_ALPHA, cut};
+use crate::composite::forward::{Canvas, LEAST_ALPHA};
 use crate::composite::intersection_gradients::{IntersectionGradients, gradient_size};
 use crate::composite::kernel::{
     BLOCK, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane,
@@ -13,6 +14,7 @@ use crate::composite::kernel::{
 use crate::composite::scene::Scene;
 use crate::math::real::Real;
 use crate::memory::pool::Pooled;
+use crate::memory::shared_slice::{OwnPieces, Scattered};
 use crate::simd::Vectors;
 use crate::simd::level::{Simd, Work};
 
@@ -33,14 +35,6 @@ pub(crate) struct CompositeGradients<T: Real> {
     pub(crate) tiles_skipped: usize,
 }
 
-/// Cuts a buffer into one piece per tile, `size` values per entry of the tile's list.
-fn pieces_by_tile<'a, U>(mut buffer: &'a mut [U], offsets: &[u32], size: usize) -> Vec<&'a mut [U]> {
-    offsets
-        .windows(2)
-        .map(|pair| cut(&mut buffer, (pair[1] - pair[0]) as usize * size))
-        .collect()
-}
-
 /// The vjp of [`crate::composite::forward::composite`].
 pub(crate) fn composite_vjp<T: Vectors>(
     scene: &Scene<'_, T>,
@@ -53,60 +47,56 @@ pub(crate) fn composite_vjp<T: Vectors>(
     let total = scene.channels.total;
     let size = gradient_size(total, absolute);
     let mut intersections = Pooled::<IntersectionGradients<T>>::take();
-    let values = intersections.values(scene.lists.gaussians.len() * size);
+    let values = Scattered::new(intersections.values(scene.lists.entries.len() * size));
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
-    (
-        pieces_by_tile(values, &scene.lists.offsets, size),
-        backgrounds.par_chunks_mut(total),
-    )
-        .into_par_iter()
-        .enumerate()
-        .for_each_init(
-            TileGradients::new,
-            |incoming, (tile, (intersections, v_background))| {
-                let mut task = scene.task(tile);
-                if task.gaussians.is_empty() && scene.background.is_none() {
-                    return;
-                }
-                let own = tile * blocks..(tile + 1) * blocks;
-                let transmittance = &canvas.transmittance[own.clone()];
-                let mut skipped = true;
-                while task.first < total {
-                    let any = level.run(Load {
-                        incoming,
-                        scene,
-                        canvas,
-                        tile,
-                        first: task.first,
-                        v,
-                    });
-                    if scene.background.is_some() {
-                        for k in 0..(total - task.first).min(MAX_CHANNELS) {
-                            v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
-                        }
+    backgrounds.par_chunks_mut(total).enumerate().for_each_init(
+        Incoming::new,
+        |incoming, (tile, v_background)| {
+            let mut task = scene.task(tile);
+            if task.entries.is_empty() && scene.background.is_none() {
+                return;
+            }
+            let own = tile * blocks..(tile + 1) * blocks;
+            let listed = scene.lists.offsets[tile] as usize..scene.lists.offsets[tile + 1] as usize;
+            let transmittance = &canvas.transmittance[own.clone()];
+            let mut skipped = true;
+            while task.first < total {
+                // SAFETY: every intersection has a number of its own and belongs to one tile, and a tile to one thread.
+                let gradients = unsafe { values.pieces(size) };
+                let any = level.run(Load {
+                    incoming,
+                    scene,
+                    canvas,
+                    tile,
+                    first: task.first,
+                    v,
+                });
+                if scene.background.is_some() {
+                    for k in 0..(total - task.first).min(MAX_CHANNELS) {
+                        v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
                     }
-                    if !any {
-                        clear(intersections, size, task.first, total);
-                    } else if !task.gaussians.is_empty() {
-                        skipped = false;
-                        let cotangents = TileCotangents {
-                            transmittance,
-                            end: &canvas.end[own.clone()],
-                            masks: &canvas.masks
-                                [scene.lists.offsets[tile] as usize..scene.lists.offsets[tile + 1] as usize],
-                            v_values: &incoming.v_values,
-                            v_transmittance: &incoming.v_transmittance,
-                        };
-                        dispatch::backward(level, &task, &cotangents, intersections, size, absolute);
-                    }
-                    task.first += MAX_CHANNELS;
                 }
-                if skipped && !task.gaussians.is_empty() {
-                    tiles_skipped.fetch_add(1, Ordering::Relaxed);
+                if !any {
+                    clear(task.entries, gradients, task.first, total);
+                } else if !task.entries.is_empty() {
+                    skipped = false;
+                    let cotangents = TileCotangents {
+                        transmittance,
+                        end: &canvas.end[own.clone()],
+                        masks: &canvas.masks[listed.clone()],
+                        v_values: &incoming.v_values,
+                        v_transmittance: &incoming.v_transmittance,
+                    };
+                    dispatch::backward(level, &task, &cotangents, gradients, absolute);
                 }
-            },
-        );
+                task.first += MAX_CHANNELS;
+            }
+            if skipped && !task.entries.is_empty() {
+                tiles_skipped.fetch_add(1, Ordering::Relaxed);
+            }
+        },
+    );
     let mut background = vec![T::ZERO; scene.channels.colored];
     for tile in backgrounds.chunks_exact(total) {
         for (sum, &v) in background.iter_mut().zip(tile) {
@@ -121,13 +111,15 @@ pub(crate) fn composite_vjp<T: Vectors>(
 }
 
 /// Zeroes what a kernel would have written for the channels of the group that starts with `first`.
-fn clear<T: Real>(gradients: &mut [T], size: usize, first: usize, total: usize) {
-    if first == 0 {
-        gradients.fill(T::ZERO);
-        return;
-    }
-    for gradient in gradients.chunks_exact_mut(size) {
-        gradient[MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS)].fill(T::ZERO);
+fn clear<T: Real>(entries: &[[u32; 2]], mut gradients: OwnPieces<'_, T>, first: usize, total: usize) {
+    let channels = MOMENTS + first..MOMENTS + total.min(first + MAX_CHANNELS);
+    for &[_, number] in entries {
+        let gradient = gradients.at(number);
+        if first == 0 {
+            gradient.fill(T::ZERO);
+        } else {
+            gradient[channels.clone()].fill(T::ZERO);
+        }
     }
 }
 
@@ -142,9 +134,9 @@ fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
     sums.into_iter().sum()
 }
 
-/// [`TileGradients::load`].
+/// [`Incoming::load`].
 struct Load<'a, T> {
-    incoming: &'a mut TileGradients<T>,
+    incoming: &'a mut Incoming<T>,
     scene: &'a Scene<'a, T>,
     canvas: &'a Canvas<T>,
     tile: usize,
@@ -163,12 +155,12 @@ impl<T: Real> Work for Load<'_, T> {
 }
 
 /// The incoming gradients of one tile, for one group of channels.
-struct TileGradients<T> {
+struct Incoming<T> {
     v_values: [TilePlane<T>; MAX_CHANNELS],
     v_transmittance: TilePlane<T>,
 }
 
-impl<T: Real> TileGradients<T> {
+impl<T: Real> Incoming<T> {
     fn new() -> Self {
         Self {
             v_values: [[Lanes::ZERO; MAX_BLOCKS]; MAX_CHANNELS],
@@ -248,28 +240,32 @@ impl<T: Real> TileGradients<T> {
     ) -> bool {
         let mut any = false;
         let colors = v.colors.as_chunks::<K>().0;
-        scene.for_block_rows(tile, |block, lane, pixel, _| {
-            let (Some(colors), Some(alphas)) = (
-                colors[pixel..].first_chunk::<BLOCK>(),
-                v.alphas[pixel..].first_chunk::<BLOCK>(),
-            ) else {
-                return;
-            };
-            let mut v_transmittance = [T::ZERO; BLOCK];
-            for k in 0..K {
-                let values = std::array::from_fn(|i| colors[i][k]);
-                any |= values != [T::ZERO; BLOCK];
-                self.v_values[k][block].rows_mut()[lane / BLOCK] = values;
-                if BACKGROUND {
+        let ((left, top), size) = (scene.grid.origin(tile), scene.grid.tile_size);
+        // A loop and no closure: one that is not inlined would be compiled for the baseline.
+        for y in 0..size {
+            let start = (top + y) * scene.grid.width + left;
+            let (colors, alphas) = (&colors[start..start + size], &v.alphas[start..start + size]);
+            let (colors, alphas) = (colors.as_chunks::<BLOCK>().0, alphas.as_chunks::<BLOCK>().0);
+            let (first, row) = (y / BLOCK * (size / BLOCK), y % BLOCK);
+            for (block, (colors, alphas)) in (first..MAX_BLOCKS).zip(colors.iter().zip(alphas)) {
+                let mut v_transmittance = [T::ZERO; BLOCK];
+                for k in 0..K {
+                    let values: [T; BLOCK] = [colors[0][k], colors[1][k], colors[2][k], colors[3][k]];
+                    self.v_values[k][block].rows_mut()[row] = values;
                     for i in 0..BLOCK {
-                        v_transmittance[i] += values[i] * background[k];
+                        any |= values[i] != T::ZERO;
+                        if BACKGROUND {
+                            v_transmittance[i] += values[i] * background[k];
+                        }
                     }
                 }
+                for i in 0..BLOCK {
+                    any |= alphas[i] != T::ZERO;
+                    v_transmittance[i] += -alphas[i];
+                }
+                self.v_transmittance[block].rows_mut()[row] = v_transmittance;
             }
-            any |= *alphas != [T::ZERO; BLOCK];
-            self.v_transmittance[block].rows_mut()[lane / BLOCK] =
-                std::array::from_fn(|i| v_transmittance[i] + -alphas[i]);
-        });
+        }
         any
     }
 }

@@ -4,6 +4,7 @@ use crate::composite::kernel::{
     Lanes, MAX_BLOCKS, MAX_CHANNELS, TileCotangents, TileImage, TilePlane, TileTask, backward_tile,
     forward_tile, median_tile,
 };
+use crate::memory::shared_slice::OwnPieces;
 use crate::simd::Vectors;
 use crate::simd::level::{Simd, SimdLevel, Work};
 use crate::simd::vector::FINEST;
@@ -32,8 +33,7 @@ impl<T: Vectors, const K: usize, const DEGREE: usize> Work for Forward<'_, T, K,
 struct Backward<'a, T, const K: usize, const ABSOLUTE: bool, const DEGREE: usize> {
     task: &'a TileTask<'a, T>,
     pixels: &'a TileCotangents<'a, T>,
-    gradients: &'a mut [T],
-    size: usize,
+    gradients: OwnPieces<'a, T>,
 }
 
 impl<T: Vectors, const K: usize, const ABSOLUTE: bool, const DEGREE: usize> Work
@@ -43,13 +43,7 @@ impl<T: Vectors, const K: usize, const ABSOLUTE: bool, const DEGREE: usize> Work
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        backward_tile::<T::In<S>, K, ABSOLUTE, DEGREE>(
-            simd,
-            self.task,
-            self.pixels,
-            self.gradients,
-            self.size,
-        );
+        backward_tile::<T::In<S>, K, ABSOLUTE, DEGREE>(simd, self.task, self.pixels, self.gradients);
     }
 }
 
@@ -112,14 +106,13 @@ pub(crate) fn backward<T: Vectors>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    gradients: &mut [T],
-    size: usize,
+    gradients: OwnPieces<'_, T>,
     absolute: bool,
 ) {
     if T::HAS_EXP_DEGREES {
         match task.limits.exp_degree {
-            3 => return backward_rough::<T, 3>(level, task, pixels, gradients, size, absolute),
-            4 => return backward_rough::<T, 4>(level, task, pixels, gradients, size, absolute),
+            3 => return backward_rough::<T, 3>(level, task, pixels, gradients, absolute),
+            4 => return backward_rough::<T, 4>(level, task, pixels, gradients, absolute),
             _ => {}
         }
     }
@@ -128,43 +121,36 @@ pub(crate) fn backward<T: Vectors>(
             task,
             pixels,
             gradients,
-            size,
         }),
         (_, true) => level.run(Backward::<_, MAX_CHANNELS, true, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
         (1, _) => level.run(Backward::<_, 1, false, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
         (2..=3, _) => level.run(Backward::<_, 3, false, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
         (4, _) => level.run(Backward::<_, 4, false, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
         (5..=6, _) => level.run(Backward::<_, 6, false, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
         _ => level.run(Backward::<_, MAX_CHANNELS, false, FINEST> {
             task,
             pixels,
             gradients,
-            size,
         }),
     }
 }
@@ -173,8 +159,7 @@ fn backward_rough<T: Vectors, const DEGREE: usize>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
     pixels: &TileCotangents<'_, T>,
-    gradients: &mut [T],
-    size: usize,
+    gradients: OwnPieces<'_, T>,
     absolute: bool,
 ) {
     match (task.channels.total - task.first, absolute) {
@@ -182,19 +167,16 @@ fn backward_rough<T: Vectors, const DEGREE: usize>(
             task,
             pixels,
             gradients,
-            size,
         }),
         (1..=3, _) => level.run(Backward::<_, 3, false, DEGREE> {
             task,
             pixels,
             gradients,
-            size,
         }),
         _ => level.run(Backward::<_, MAX_CHANNELS, false, DEGREE> {
             task,
             pixels,
             gradients,
-            size,
         }),
     }
 }

@@ -22,7 +22,7 @@ pub(crate) struct Canvas<T> {
     pub(crate) transmittance: Vec<Lanes<T>>,
     /// See [`TileImage`]; not set for a tile that nothing reaches.
     pub(crate) end: Vec<Lanes<T>>,
-    /// Which blocks of its tile each intersection reaches; in the order of `TileLists::gaussians`.
+    /// Which blocks of its tile each intersection reaches; in the order of `TileLists::entries`.
     pub(crate) masks: Vec<u16>,
     /// Accumulated depth where the image has expected depth, else empty; set as transmittance is.
     pub(crate) depths: Vec<Lanes<T>>,
@@ -119,7 +119,7 @@ pub(crate) fn composite<T: Vectors>(
         transmittance: stale(&mut out.transmittance, blocks),
         end: stale(&mut out.end, blocks),
         depths: stale(&mut out.depths, if scene.expected_depth { blocks } else { 0 }),
-        masks: stale(&mut out.masks, scene.lists.gaussians.len()),
+        masks: stale(&mut out.masks, scene.lists.entries.len()),
     };
     let strips: Vec<Strip<'_, T>> = colors
         .chunks_mut(grid.tile_size * grid.width * total)
@@ -166,7 +166,7 @@ fn composite_tile<T: Vectors>(
     let blocks = scene.blocks();
     let total = scene.channels.total;
     let mut task = scene.task(out.tile);
-    if task.gaussians.is_empty() {
+    if task.entries.is_empty() {
         if scene.background.is_none() {
             return 0;
         }
@@ -249,6 +249,30 @@ fn write_tile<T: Real>(scene: &Scene<'_, T>, background: &[T], planes: &[Lanes<T
     }
 }
 
+/// Colours and alphas of a row of a block, over the background.
+#[inline(always)]
+fn row_of_block<T: Real, const K: usize>(
+    block: usize,
+    row: usize,
+    blocks: usize,
+    background: &[T; K],
+    planes: &[Lanes<T>],
+    transmittance: &[Lanes<T>],
+) -> ([[T; K]; BLOCK], [T; BLOCK]) {
+    let transmittance = transmittance[block].rows()[row];
+    let (mut colors, mut alphas) = ([[T::ZERO; K]; BLOCK], [T::ZERO; BLOCK]);
+    for k in 0..K {
+        let values = planes[k * blocks + block].rows()[row];
+        for i in 0..BLOCK {
+            colors[i][k] = values[i] + transmittance[i] * background[k];
+        }
+    }
+    for i in 0..BLOCK {
+        alphas[i] = T::ONE - transmittance[i];
+    }
+    (colors, alphas)
+}
+
 /// [`write_tile`] for the usual numbers of channels and no division, a row of a block at a time.
 #[inline(always)]
 fn write_colors<T: Real, const K: usize>(
@@ -265,24 +289,11 @@ fn write_colors<T: Real, const K: usize>(
         let (whole_colors, last_colors) = colors.as_chunks_mut::<BLOCK>();
         let (whole_alphas, last_alphas) = alphas.as_chunks_mut::<BLOCK>();
         let last = first + whole_alphas.len();
-        let pixels = |block: usize| {
-            let transmittance = out.transmittance[block].rows()[row];
-            let values: [[T; BLOCK]; K] = std::array::from_fn(|k| planes[k * blocks + block].rows()[row]);
-            let mut colors = [[T::ZERO; K]; BLOCK];
-            let mut alphas = [T::ZERO; BLOCK];
-            for i in 0..BLOCK {
-                for k in 0..K {
-                    colors[i][k] = values[k][i] + transmittance[i] * background[k];
-                }
-                alphas[i] = T::ONE - transmittance[i];
-            }
-            (colors, alphas)
-        };
         for (block, (colors, alphas)) in (first..).zip(whole_colors.iter_mut().zip(whole_alphas)) {
-            (*colors, *alphas) = pixels(block);
+            (*colors, *alphas) = row_of_block(block, row, blocks, &background, planes, out.transmittance);
         }
         if !last_alphas.is_empty() {
-            let (colors, alphas) = pixels(last);
+            let (colors, alphas) = row_of_block(last, row, blocks, &background, planes, out.transmittance);
             last_colors.copy_from_slice(&colors[..last_colors.len()]);
             last_alphas.copy_from_slice(&alphas[..last_alphas.len()]);
         }

@@ -4,9 +4,8 @@ use crate::composite::kernel::{ABSOLUTES, LANES, MOMENTS};
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, bytes_of, stale};
 
-/// One gradient per entry of [`crate::lists::tile_lists::TileLists::gaussians`]: `MOMENTS`, then channels, then
-/// `ABSOLUTES` if asked for. They lie without gaps, because they are read in another order than they are written, so
-/// the number of them that fits into the caches decides.
+/// One gradient per intersection, by its number (see [`crate::lists::tile_lists::TileLists::entries`]): those of one
+/// Gaussian lie side by side. Each holds `MOMENTS`, then channels, then `ABSOLUTES` if asked for, without gaps.
 #[derive(Debug)]
 pub(crate) struct IntersectionGradients<T>(Vec<T>);
 

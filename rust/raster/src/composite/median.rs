@@ -19,7 +19,7 @@ pub(crate) fn medians<T: Vectors>(scene: &Scene<'_, T>, canvas: &Canvas<T>) -> V
         let mut places = [Lanes::ZERO; MAX_BLOCKS];
         for tile in row * grid.columns..(row + 1) * grid.columns {
             let task = scene.task(tile);
-            if task.gaussians.is_empty() {
+            if task.entries.is_empty() {
                 continue;
             }
             let list = scene.lists.offsets[tile] as usize..scene.lists.offsets[tile + 1] as usize;
@@ -29,7 +29,7 @@ pub(crate) fn medians<T: Vectors>(scene: &Scene<'_, T>, canvas: &Canvas<T>) -> V
                 let own = &mut ids[pixel - row * rows..][..count];
                 for (id, place) in own.iter_mut().zip(&places[block].0[lane..]) {
                     if let Some(place) = place.past_ordinal().checked_sub(1) {
-                        *id = task.gaussians[place as usize] as i32;
+                        *id = task.entries[place as usize][0] as i32;
                     }
                 }
             });

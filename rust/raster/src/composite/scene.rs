@@ -1,6 +1,6 @@
 //! What all tiles of a view share.
 
-use crate::composite::kernel::{BLOCK, Channels, LANES, MAX_BLOCKS, TileTask};
+use crate::composite::kernel::{BLOCK, Channels, LANES, MAX_BLOCKS, TileTask, anchor};
 use crate::input::settings::Limits;
 use crate::lists::tile_lists::TileLists;
 use crate::math::real::Real;
@@ -22,10 +22,12 @@ pub(crate) struct Scene<'a, T> {
 
 impl<'a, T: Real> Scene<'a, T> {
     pub(crate) fn task(&self, tile: usize) -> TileTask<'a, T> {
+        let origin = self.grid.origin(tile);
         TileTask {
-            origin: self.grid.origin(tile),
+            origin,
+            anchor: anchor(origin),
             side: self.grid.tile_size / BLOCK,
-            gaussians: &self.lists.gaussians
+            entries: &self.lists.entries
                 [self.lists.offsets[tile] as usize..self.lists.offsets[tile + 1] as usize],
             splats: self.splats,
             channels: self.channels,

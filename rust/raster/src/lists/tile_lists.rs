@@ -15,17 +15,16 @@ use crate::project::tiles::Cover;
 /// For every tile the splats that may reach it, front to back.
 #[derive(Debug, Default)]
 pub(crate) struct TileLists {
-    /// Tile t owns `gaussians[offsets[t]..offsets[t + 1]]`.
+    /// Tile t owns `entries[offsets[t]..offsets[t + 1]]`.
     pub(crate) offsets: Vec<u32>,
-    /// Indices of Gaussians.
-    pub(crate) gaussians: Vec<u32>,
-    /// Intersection by intersection, Gaussian by Gaussian and within each tile by tile: where in `gaussians` it stands.
-    pub(crate) positions: Vec<u32>,
+    /// The index of a Gaussian, and the number of its intersection with the tile, counted Gaussian by Gaussian and within
+    /// each tile by tile.
+    pub(crate) entries: Vec<[u32; 2]>,
 }
 
 impl Buffers for TileLists {
     fn bytes(&self) -> usize {
-        bytes_of(&self.offsets) + bytes_of(&self.gaussians) + bytes_of(&self.positions)
+        bytes_of(&self.offsets) + bytes_of(&self.entries)
     }
 }
 
@@ -125,8 +124,7 @@ pub(crate) fn bin_splats<T: Real>(
 /// The lists of all tiles while they are made.
 struct Lists<'a> {
     covers: &'a [Cover],
-    gaussians: Shared<'a>,
-    positions: Shared<'a>,
+    entries: Shared<'a>,
 }
 
 impl Lists<'_> {
@@ -147,10 +145,8 @@ impl Lists<'_> {
     #[inline(always)]
     fn put(&self, i: u32, mut place: impl FnMut(u32) -> u32) {
         let (cover, local) = self.cover_of(i);
-        for (own, &tile) in cover.intersections_of(local).zip(cover.tiles_of(local)) {
-            let at = place(tile);
-            self.gaussians.set(at as usize, i);
-            self.positions.set(own, at);
+        for (number, &tile) in cover.intersections_of(local).zip(cover.tiles_of(local)) {
+            self.entries.set(place(tile) as usize, [i, number as u32]);
         }
     }
 }
@@ -163,8 +159,7 @@ fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &m
     let intersections = lists.offsets.last().map_or(0, |&end| end as usize);
     let out = Lists {
         covers,
-        gaussians: Shared::new(stale(&mut lists.gaussians, intersections)),
-        positions: Shared::new(stale(&mut lists.positions, intersections)),
+        entries: Shared::new(stale(&mut lists.entries, intersections)),
     };
     scratch.fronts.clone_from(&lists.offsets);
     match rayon::current_num_threads() {

@@ -82,7 +82,7 @@ impl<T: Scalar> ViewState<T> {
     }
 
     pub(crate) fn intersections(&self) -> usize {
-        self.lists.gaussians.len()
+        self.lists.entries.len()
     }
 
     pub(crate) fn saturated(&self) -> usize {
@@ -216,7 +216,6 @@ impl<T: Scalar> ViewState<T> {
             &self.camera,
             &self.limits,
             &self.projected,
-            &self.lists,
             scene.channels,
             gradients.intersections.written(),
             out,

@@ -279,7 +279,7 @@ impl Cover {
         self.base = base;
     }
 
-    /// Where a Gaussian's own part of [`crate::lists::tile_lists::TileLists::positions`] is.
+    /// The numbers of a Gaussian's intersections.
     #[inline(always)]
     pub(crate) fn intersections_of(&self, local: usize) -> std::ops::Range<usize> {
         (self.base + self.begins[local]) as usize..(self.base + self.begins[local + 1]) as usize

@@ -1,10 +1,12 @@
 //! One tile, back to front, gradients.
 
 use super::{
-    ABSOLUTES, AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane,
-    TileTask, WORD,
+    ABSOLUTES, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane, TileTask,
+    WORD,
 };
 use crate::math::real::Real;
+use crate::memory::shared_slice::OwnPieces;
+use crate::simd::prefetch;
 use crate::simd::vector::{MAX_SUMS, Vector};
 
 /// What backward needs of a tile's pixels, in block order.
@@ -149,17 +151,15 @@ fn write<T: Real, const K: usize, const ABSOLUTE: bool>(
     }
 }
 
-/// Writes, for every splat of the tile, its moments and the gradients of its channels to `gradients` (`size` values
-/// each: the moments, then all channels, then the absolutes if ABSOLUTE).
+/// Writes, for every splat of the tile, to the piece with its intersection's number: its moments, the gradients of its channels, and the absolutes if ABSOLUTE.
 #[inline(always)]
 pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, const DEGREE: usize>(
     level: V::Level,
     task: &TileTask<'_, V::Scalar>,
     pixels: &TileCotangents<'_, V::Scalar>,
-    gradients: &mut [V::Scalar],
-    size: usize,
+    mut gradients: OwnPieces<'_, V::Scalar>,
 ) {
-    let zero = V::Scalar::ZERO;
+    let (zero, size) = (V::Scalar::ZERO, gradients.size());
     let blocks = task.side * task.side;
     let centres = PixelCentres::new(task);
     let mut state = [Block {
@@ -203,10 +203,12 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
     };
 
     let mut entries = [Entry::<V::Scalar, K>::ZERO; WORD];
-    for batch in (0..task.gaussians.len()).step_by(WORD).rev() {
-        let masks = &pixels.masks[batch..task.gaussians.len().min(batch + WORD)];
+    for batch in (0..task.entries.len()).step_by(WORD).rev() {
+        let masks = &pixels.masks[batch..task.entries.len().min(batch + WORD)];
         for (i, mask) in masks.iter().enumerate() {
-            task.prefetch(batch + i + AHEAD);
+            // The next batch, while this one is worked on.
+            task.prefetch((batch + i).wrapping_sub(WORD));
+            prefetch(gradients.at(task.entries[batch + i][1]), size - 1);
             if mask & (active | waiting) != 0 {
                 entries[i] = Entry::load(task, batch + i);
             }
@@ -226,7 +228,7 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
                 }
             }
             let mut rest = mask & active;
-            let gradient = &mut gradients[(batch + i) * size..][..size];
+            let gradient = gradients.at(task.entries[batch + i][1]);
             if rest == 0 {
                 write::<V::Scalar, K, ABSOLUTE>(task, gradient, &[zero; MAX_SUMS]);
                 continue;

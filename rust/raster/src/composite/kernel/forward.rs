@@ -96,17 +96,17 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
 
     let mut entries = [Entry::<V::Scalar, K>::ZERO; BATCH];
     let mut batch = 0;
-    while batch < task.gaussians.len() && taking != 0 {
-        let size = BATCH.min(task.gaussians.len() - batch);
-        let mut masks = [[0u16; WORD]; BATCH / WORD];
+    while batch < task.entries.len() && taking != 0 {
+        let size = BATCH.min(task.entries.len() - batch);
+        let mut masks = [[0u16; WORD]; 2];
         for i in 0..size {
             task.prefetch(batch + i + AHEAD);
-            let splat = &task.splats[task.gaussians[batch + i] as usize];
+            let splat = &task.splats[task.entries[batch + i][0] as usize];
             masks[i / WORD][i % WORD] = block_centres.reached::<V>(level, splat, task.centre(splat)) & taking;
             entries[i] = Entry::load(task, batch + i);
         }
         out.masks[batch..batch + size].copy_from_slice(&masks.as_flattened()[..size]);
-        let words = masks.each_ref().map(transpose_bits);
+        let words = [transpose_bits(&masks[0]), transpose_bits(&masks[1])];
 
         let mut rest = taking;
         while rest != 0 {
@@ -150,7 +150,7 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
         }
         batch += size;
     }
-    out.masks[batch.min(task.gaussians.len())..].fill(0);
+    out.masks[batch.min(task.entries.len())..].fill(0);
 
     let rendered: u32 = open[..blocks].iter().map(|bits| bits.count_ones()).sum();
     let mut unstopped_pixels = 0;

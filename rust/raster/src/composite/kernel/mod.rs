@@ -97,15 +97,23 @@ pub(crate) struct Channels<'a, T> {
     pub(crate) colored: usize,
 }
 
+/// Where coordinates of the kernels have their zero: the middle of the 16×16 pixels around the tile with this first pixel.
+/// Small coordinates round least, and an anchor that is the same for tiles of any size gives the same bits for each.
+pub(crate) fn anchor<T: Real>((left, top): (usize, usize)) -> [T; 2] {
+    [left, top].map(|first| T::of((first - first % MAX_SIDE + MAX_SIDE / 2) as f64))
+}
+
 /// One tile's work: everything but the outputs.
 #[derive(Clone, Copy)]
 pub(crate) struct TileTask<'a, T> {
     /// Top-left pixel.
     pub(crate) origin: (usize, usize),
+    /// [`anchor`] of it.
+    pub(crate) anchor: [T; 2],
     /// Blocks along a side.
     pub(crate) side: usize,
-    /// The Gaussians of the tile's list, front to back.
-    pub(crate) gaussians: &'a [u32],
+    /// The tile's list, front to back: see [`crate::lists::tile_lists::TileLists::entries`].
+    pub(crate) entries: &'a [[u32; 2]],
     /// By Gaussian.
     pub(crate) splats: &'a [Splat<T>],
     pub(crate) channels: Channels<'a, T>,
@@ -115,14 +123,6 @@ pub(crate) struct TileTask<'a, T> {
 }
 
 impl<T: Real> TileTask<'_, T> {
-    /// Where coordinates of the kernels have their zero: the middle of the 16×16 pixels around the tile. Small
-    /// coordinates round least, and an anchor that is the same for tiles of any size gives the same bits for each.
-    #[inline(always)]
-    fn anchor(&self) -> [T; 2] {
-        let middle = |first: usize| T::of((first - first % MAX_SIDE + MAX_SIDE / 2) as f64);
-        [middle(self.origin.0), middle(self.origin.1)]
-    }
-
     /// The first pixel centre of the tile, from its anchor.
     #[inline(always)]
     fn first_centre(&self) -> [T; 2] {
@@ -133,7 +133,7 @@ impl<T: Real> TileTask<'_, T> {
     /// Prefetches the splat and the colours of a place in the list. Neighbours in the list are no neighbours in memory.
     #[inline(always)]
     fn prefetch(&self, index: usize) {
-        if let Some(&gaussian) = self.gaussians.get(index) {
+        if let Some(&[gaussian, _]) = self.entries.get(index) {
             prefetch(self.splats, gaussian as usize);
             prefetch(
                 self.channels.colors,
@@ -145,8 +145,7 @@ impl<T: Real> TileTask<'_, T> {
     /// Centre of a splat from the tile's anchor.
     #[inline(always)]
     fn centre(&self, splat: &Splat<T>) -> [T; 2] {
-        let [x, y] = self.anchor();
-        [splat.x - x, splat.y - y]
+        [splat.x - self.anchor[0], splat.y - self.anchor[1]]
     }
 
     /// The least alpha of a pair that counts; infinite if alpha is limited to less than the threshold.
@@ -190,7 +189,7 @@ impl<T: Real, const K: usize> Entry<T, K> {
 
     #[inline(always)]
     fn load(task: &TileTask<'_, T>, index: usize) -> Self {
-        let gaussian = task.gaussians[index] as usize;
+        let gaussian = task.entries[index][0] as usize;
         let splat = &task.splats[gaussian];
         let [x, y] = task.centre(splat);
         let mut values = [T::ZERO; K];

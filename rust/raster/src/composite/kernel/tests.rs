@@ -4,6 +4,7 @@ use super::*;
 use crate::composite::dispatch;
 use crate::composite::intersection_gradients::gradient_size;
 use crate::input::settings::RasterSettings;
+use crate::memory::shared_slice::Scattered;
 use crate::simd::Vectors;
 use crate::simd::level::{Baseline, SimdLevel};
 use crate::simd::portable::Portable;
@@ -63,12 +64,14 @@ fn run_with<T: Vectors>(runner: Runner, channels: usize, side: usize, settings: 
         })
         .collect();
     let colors: Vec<T> = (0..SPLATS * channels).map(|_| T::of(uniform())).collect();
-    let all: Vec<u32> = (0..SPLATS as u32).collect();
+    // Gradients go in the reverse order of the list.
+    let all: Vec<[u32; 2]> = (0..SPLATS as u32).map(|i| [i, SPLATS as u32 - 1 - i]).collect();
     let limits = Limits::new(settings).unwrap();
     let mut task = TileTask {
         origin: (64, 32),
+        anchor: super::anchor((64, 32)),
         side,
-        gaussians: &all,
+        entries: &all,
         splats: &splats,
         channels: Channels {
             colors: &colors,
@@ -118,19 +121,13 @@ fn run_with<T: Vectors>(runner: Runner, channels: usize, side: usize, settings: 
             v_values: &v_values,
             v_transmittance: &v_transmittance,
         };
+        let mut scattered = Scattered::new(&mut gradients);
+        let out = scattered.all_pieces(size);
         match runner {
-            Runner::Level(level) => {
-                dispatch::backward(level, &task, &cotangents, &mut gradients, size, false)
-            }
+            Runner::Level(level) => dispatch::backward(level, &task, &cotangents, out, false),
             Runner::Portable => {
                 let level = Portable::guaranteed();
-                backward_tile::<T::In<Portable>, MAX_CHANNELS, false, FINEST>(
-                    level,
-                    &task,
-                    &cotangents,
-                    &mut gradients,
-                    size,
-                );
+                backward_tile::<T::In<Portable>, MAX_CHANNELS, false, FINEST>(level, &task, &cotangents, out);
             }
         }
         task.first += MAX_CHANNELS;
