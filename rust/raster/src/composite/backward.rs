@@ -9,7 +9,7 @@ use crate::composite::dispatch;
 use crate::composite::forward::{Canvas, LEAST_ALPHA};
 use crate::composite::intersection_gradients::{IntersectionGradients, gradient_size};
 use crate::composite::kernel::{
-    BLOCK, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, TileCotangents, TilePlane,
+    BLOCK, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MAX_SIDE, MOMENTS, TileCotangents, TilePlane,
 };
 use crate::composite::scene::Scene;
 use crate::math::real::Real;
@@ -54,7 +54,15 @@ pub(crate) fn composite_vjp<T: Vectors>(
         Incoming::new,
         |incoming, (tile, v_background)| {
             let mut task = scene.task(tile);
-            if task.entries.is_empty() && scene.background.is_none() {
+            if task.entries.is_empty() {
+                if scene.background.is_some() {
+                    level.run(SumIncoming {
+                        scene,
+                        tile,
+                        v,
+                        sums: v_background,
+                    });
+                }
                 return;
             }
             let own = tile * blocks..(tile + 1) * blocks;
@@ -71,15 +79,11 @@ pub(crate) fn composite_vjp<T: Vectors>(
                     tile,
                     first: task.first,
                     v,
+                    v_background: &mut *v_background,
                 });
-                if scene.background.is_some() {
-                    for k in 0..(total - task.first).min(MAX_CHANNELS) {
-                        v_background[task.first + k] = dot(transmittance, &incoming.v_values[k]);
-                    }
-                }
                 if !any {
                     clear(task.entries, gradients, task.first, total);
-                } else if !task.entries.is_empty() {
+                } else {
                     skipped = false;
                     let cotangents = TileCotangents {
                         transmittance,
@@ -92,7 +96,7 @@ pub(crate) fn composite_vjp<T: Vectors>(
                 }
                 task.first += MAX_CHANNELS;
             }
-            if skipped && !task.entries.is_empty() {
+            if skipped {
                 tiles_skipped.fetch_add(1, Ordering::Relaxed);
             }
         },
@@ -124,6 +128,7 @@ fn clear<T: Real>(entries: &[[u32; 2]], mut gradients: OwnPieces<'_, T>, first: 
 }
 
 /// Lane by lane, then over the lanes.
+#[inline(always)]
 fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
     let mut sums = [T::ZERO; LANES];
     for (a, b) in a.iter().zip(b) {
@@ -134,6 +139,69 @@ fn dot<T: Real>(a: &[Lanes<T>], b: &[Lanes<T>]) -> T {
     sums.into_iter().sum()
 }
 
+/// Sums the incoming gradients of a tile that nothing reaches: those of the background.
+struct SumIncoming<'a, T> {
+    scene: &'a Scene<'a, T>,
+    tile: usize,
+    v: Cotangents<'a, T>,
+    sums: &'a mut [T],
+}
+
+impl<T: Real> Work for SumIncoming<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        match (self.sums.len(), self.scene.pixel_mask) {
+            (1, None) => self.sum::<1>(),
+            (3, None) => self.sum::<3>(),
+            (4, None) => self.sum::<4>(),
+            (total, mask) => {
+                let Self { scene, tile, v, sums } = self;
+                scene.for_block_rows(tile, |_, _, pixel, count| {
+                    for pixel in (pixel..pixel + count).filter(|&pixel| mask.is_none_or(|mask| mask[pixel])) {
+                        for (sum, &v) in sums.iter_mut().zip(&v.colors[pixel * total..]) {
+                            *sum += v;
+                        }
+                    }
+                });
+            }
+        }
+    }
+}
+
+impl<T: Real> SumIncoming<'_, T> {
+    /// Of K channels and all pixels: by column of the tile, then over the columns.
+    #[inline(always)]
+    fn sum<const K: usize>(self) {
+        let (grid, colors) = (&self.scene.grid, self.v.colors.as_chunks::<K>().0);
+        let (left, top) = grid.origin(self.tile);
+        let columns = grid.tile_size.min(grid.width - left);
+        let mut sums = [[T::ZERO; K]; MAX_SIDE];
+        for y in top..(top + grid.tile_size).min(grid.height) {
+            let row = &colors[y * grid.width + left..][..columns];
+            if let Some(row) = row.first_chunk::<MAX_SIDE>() {
+                for x in 0..MAX_SIDE {
+                    for k in 0..K {
+                        sums[x][k] += row[x][k];
+                    }
+                }
+            } else {
+                for (sum, values) in sums.iter_mut().zip(row) {
+                    for k in 0..K {
+                        sum[k] += values[k];
+                    }
+                }
+            }
+        }
+        for sum in sums {
+            for k in 0..K {
+                self.sums[k] += sum[k];
+            }
+        }
+    }
+}
+
 /// [`Incoming::load`].
 struct Load<'a, T> {
     incoming: &'a mut Incoming<T>,
@@ -142,6 +210,8 @@ struct Load<'a, T> {
     tile: usize,
     first: usize,
     v: Cotangents<'a, T>,
+    /// Of all channels.
+    v_background: &'a mut [T],
 }
 
 impl<T: Real> Work for Load<'_, T> {
@@ -149,8 +219,15 @@ impl<T: Real> Work for Load<'_, T> {
 
     #[inline(always)]
     fn run<S: Simd>(self, _: S) -> bool {
-        self.incoming
-            .load(self.scene, self.canvas, self.tile, self.first, self.v)
+        let (scene, first) = (self.scene, self.first);
+        let any = self.incoming.load(scene, self.canvas, self.tile, first, self.v);
+        if scene.background.is_some() {
+            let transmittance = &self.canvas.transmittance[self.tile * scene.blocks()..][..scene.blocks()];
+            for (sum, v) in self.v_background[first..].iter_mut().zip(&self.incoming.v_values) {
+                *sum = dot(transmittance, v);
+            }
+        }
+        any
     }
 }
 
@@ -238,7 +315,8 @@ impl<T: Real> Incoming<T> {
         v: Cotangents<'_, T>,
         background: &[T; MAX_CHANNELS],
     ) -> bool {
-        let mut any = false;
+        // Of absolute values: as long as all are zero, so is it. Comparisons would be made one by one.
+        let mut sums = [T::ZERO; BLOCK];
         let colors = v.colors.as_chunks::<K>().0;
         let ((left, top), size) = (scene.grid.origin(tile), scene.grid.tile_size);
         // A loop and no closure: one that is not inlined would be compiled for the baseline.
@@ -253,19 +331,19 @@ impl<T: Real> Incoming<T> {
                     let values: [T; BLOCK] = [colors[0][k], colors[1][k], colors[2][k], colors[3][k]];
                     self.v_values[k][block].rows_mut()[row] = values;
                     for i in 0..BLOCK {
-                        any |= values[i] != T::ZERO;
+                        sums[i] += values[i].abs();
                         if BACKGROUND {
                             v_transmittance[i] += values[i] * background[k];
                         }
                     }
                 }
                 for i in 0..BLOCK {
-                    any |= alphas[i] != T::ZERO;
+                    sums[i] += alphas[i].abs();
                     v_transmittance[i] += -alphas[i];
                 }
                 self.v_transmittance[block].rows_mut()[row] = v_transmittance;
             }
         }
-        any
+        sums != [T::ZERO; BLOCK]
     }
 }

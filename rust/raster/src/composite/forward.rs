@@ -18,13 +18,13 @@ pub(crate) const LEAST_ALPHA: f64 = 1e-10;
 /// What the backward pass needs of the composited tiles. Tile-major, a block of pixels in each `Lanes`.
 #[derive(Debug)]
 pub(crate) struct Canvas<T> {
-    /// Not set for a tile that nothing reaches, unless there is a background.
+    /// Not set for a tile that nothing reaches, nor is what follows.
     pub(crate) transmittance: Vec<Lanes<T>>,
-    /// See [`TileImage`]; not set for a tile that nothing reaches.
+    /// See [`TileImage`].
     pub(crate) end: Vec<Lanes<T>>,
     /// Which blocks of its tile each intersection reaches; in the order of `TileLists::entries`.
     pub(crate) masks: Vec<u16>,
-    /// Accumulated depth where the image has expected depth, else empty; set as transmittance is.
+    /// Accumulated depth where the image has expected depth, else empty.
     pub(crate) depths: Vec<Lanes<T>>,
     /// Pixels that stopped before the end of their tile's list.
     pub(crate) saturated: usize,
@@ -135,7 +135,10 @@ pub(crate) fn composite<T: Vectors>(
             strip
         })
         .collect();
-    let background: Vec<T> = (0..total).map(|channel| scene.background(channel)).collect();
+    // For a row of a tile.
+    let background: Vec<T> = (0..grid.tile_size * total)
+        .map(|i| scene.background(i % total))
+        .collect();
     let planes = || vec![Lanes::ZERO; (total + SPARE_CHANNELS) * scene.blocks()];
     let saturated = AtomicUsize::new(0);
     strips
@@ -167,25 +170,25 @@ fn composite_tile<T: Vectors>(
     let total = scene.channels.total;
     let mut task = scene.task(out.tile);
     if task.entries.is_empty() {
-        if scene.background.is_none() {
-            return 0;
+        if scene.background.is_some() {
+            for row in out.colors {
+                row.copy_from_slice(&background[..row.len()]);
+            }
         }
-        planes[..total * blocks].fill(Lanes::ZERO);
-        out.transmittance.fill(Lanes::ONE);
-    } else {
-        let open = scene.open_pixels(out.tile);
-        while task.first < total {
-            let tile_image = TileImage {
-                colors: &mut planes[task.first * blocks..],
-                transmittance: &mut *out.transmittance,
-                end: &mut *out.end,
-                masks: &mut *out.masks,
-                // Every group of channels counts the same pixels.
-                saturated: &mut saturated,
-            };
-            dispatch::forward(level, &task, &open, tile_image);
-            task.first += MAX_CHANNELS;
-        }
+        return 0;
+    }
+    let open = scene.open_pixels(out.tile);
+    while task.first < total {
+        let tile_image = TileImage {
+            colors: &mut planes[task.first * blocks..],
+            transmittance: &mut *out.transmittance,
+            end: &mut *out.end,
+            masks: &mut *out.masks,
+            // Every group of channels counts the same pixels.
+            saturated: &mut saturated,
+        };
+        dispatch::forward(level, &task, &open, tile_image);
+        task.first += MAX_CHANNELS;
     }
     if scene.expected_depth {
         out.depths

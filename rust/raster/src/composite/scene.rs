@@ -65,8 +65,11 @@ impl<'a, T: Real> Scene<'a, T> {
     pub(crate) fn open_pixels(&self, tile: usize) -> [u16; MAX_BLOCKS] {
         let mut open = [0u16; MAX_BLOCKS];
         self.for_block_rows(tile, |block, lane, pixel, count| {
-            for i in 0..count {
-                let wanted = self.pixel_mask.is_none_or(|mask| mask[pixel + i]);
+            let Some(mask) = self.pixel_mask else {
+                open[block] |= ((1u16 << count) - 1) << lane;
+                return;
+            };
+            for (i, &wanted) in mask[pixel..pixel + count].iter().enumerate() {
                 open[block] |= u16::from(wanted) << (lane + i);
             }
         });

@@ -170,8 +170,7 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
         camera_zs[lane] = depth;
         radii[lane] = [ceil_xs[lane] as i32, ceil_ys[lane] as i32];
         if rxs[lane].greater(rys[lane]) >= most {
-            // The cast saturates: a Gaussian without bounds gets the largest integer.
-            radii[lane] = [rxs[lane], rys[lane]].map(|r| r.as_f64().ceil() as i32);
+            radii[lane] = huge_radii([rxs[lane], rys[lane]]);
         }
         let ellipse = Ellipse {
             x,
@@ -187,6 +186,14 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     }
     cutter.flush(out.cover);
     out.cover.finish();
+}
+
+/// Radii beyond [`MOST_EXACT`]. The cast saturates: a Gaussian without bounds gets the largest integer. Apart, because the
+/// compiler would work them out for every Gaussian.
+#[cold]
+#[inline(never)]
+fn huge_radii<T: Real>(radii: [T; 2]) -> [i32; 2] {
+    radii.map(|r| r.as_f64().ceil() as i32)
 }
 
 /// Gradients of the splats of a packet, packed: lane by lane those of the Gaussians that have any.
