@@ -84,3 +84,24 @@ def test_an_unknown_instruction_set_is_named_with_those_that_there_are() -> None
     )
     assert told.stdout.startswith("BIGS_RASTER_SIMD: expected one of ")
     assert told.stdout.endswith(", found 'AVX2'\n") and "baseline" in told.stdout
+
+
+def test_arrays_of_another_kind_are_told_by_name_and_dtype() -> None:
+    inputs = arrays()
+    mask = np.ones((16, 16), dtype=np.uint8)
+    with pytest.raises(TypeError, match="pixel_mask: expected an array of bool, found uint8"):
+        forward((*inputs[:8], mask))
+    with pytest.raises(TypeError, match="quats: expected an array of float32, found float64"):
+        forward((inputs[0], inputs[1].astype(np.float64), *inputs[2:]))
+    with pytest.raises(TypeError, match="opacities: expected an array of float32, found .*list"):
+        forward((*inputs[:3], [0.5] * 6, *inputs[4:]))
+
+
+def test_leading_axes_fit_the_images() -> None:
+    inputs = arrays()
+    for lead in ((2,), (2**63, 2), (2**64 - 1,)):
+        with pytest.raises(ValueError, match="lead: expected axes for 768 values"):
+            _raster.rasterize_forward(inputs, SHARED, lead, 16, 16, RasterSettings(), "RGB", "pinhole")
+    state = forward(inputs)[-1]
+    with pytest.raises(ValueError, match="lead: expected axes for 256 values"):
+        state.median_ids((2**64 - 1,), 16, 16)

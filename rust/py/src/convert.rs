@@ -2,20 +2,26 @@
 
 use bigs_raster::{BatchInputs, BatchShape, CameraModel, GaussianSlabs, Scalar, Slabs};
 use numpy::{
-    Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+    Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray,
+    PyUntypedArrayMethods, dtype,
 };
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-/// A borrowed array of this scalar; `TypeError` for another dtype.
+/// A borrowed array of this scalar, which is that of the first array of a call; `TypeError` for another one.
 pub(crate) fn slice<'py, T: Element>(
     name: &str,
     array: &Bound<'py, PyAny>,
 ) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
-    let array = array
-        .cast::<PyArrayDyn<T>>()
-        .map_err(|_| PyTypeError::new_err(format!("{name}: expected one floating dtype for all arrays")))?;
+    let array = array.cast::<PyArrayDyn<T>>().map_err(|_| {
+        let found = array.cast::<PyUntypedArray>().map_or_else(
+            |_| format!("{}", array.get_type()),
+            |array| array.dtype().to_string(),
+        );
+        let expected = dtype::<T>(array.py());
+        PyTypeError::new_err(format!("{name}: expected an array of {expected}, found {found}"))
+    })?;
     Ok(array.readonly())
 }
 
@@ -201,6 +207,17 @@ pub(crate) fn array<'py, U: Element>(
     own: &[usize],
 ) -> PyResult<Bound<'py, PyAny>> {
     let shape: Vec<usize> = lead.iter().chain(own).copied().collect();
+    // Checked here: numpy takes the largest size for "whatever fits".
+    if shape
+        .iter()
+        .fold(1usize, |product, &size| product.saturating_mul(size))
+        != values.len()
+    {
+        return Err(PyValueError::new_err(format!(
+            "lead: expected axes for {} values, found shape {shape:?}",
+            values.len()
+        )));
+    }
     Ok(values.into_pyarray(py).reshape(shape)?.into_any())
 }
 

@@ -6,9 +6,15 @@ use crate::color::basis::{basis, basis_vjp};
 use crate::error::RasterError;
 use crate::input::gaussians::{check_degree, check_length};
 use crate::math::real::Real;
+use crate::simd::level::{Simd, SimdLevel, Work};
 
 /// Gaussians handled by one task. Fixed, so that sums do not depend on the number of threads.
 const PACKET_SIZE: usize = 512;
+/// Gaussians whose directions are worked on at once, in loops that vectorise.
+const LANES: usize = 16;
+
+/// A number for each of some Gaussians.
+type Column<T> = [T; LANES];
 
 /// Checked coefficients and directions of spherical harmonics; see [`crate::Harmonics`].
 #[derive(Clone, Copy, Debug)]
@@ -18,6 +24,7 @@ pub(crate) struct HarmonicSums<'a, T> {
     pub(crate) dirs: &'a [[T; 3]],
     pub(crate) coefficients: &'a [T],
     mask: Option<&'a [bool]>,
+    level: SimdLevel,
 }
 
 /// Gradients of what [`crate::Harmonics`] was made of; empty if not asked for.
@@ -52,6 +59,7 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
             dirs,
             coefficients,
             mask,
+            level: SimdLevel::chosen()?,
         })
     }
 
@@ -87,24 +95,14 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
     }
 
     fn evaluate_bands<const B: usize>(&self) -> Vec<[T; 3]> {
-        let n = self.gaussians();
         let mut colors = vec![[T::ZERO; 3]; self.dirs.len()];
-        let pieces = by_packet(&mut colors, n);
-        pieces.into_par_iter().enumerate().for_each(|(packet, places)| {
-            for (place, colors) in places.into_iter().enumerate() {
-                for (local, color) in colors.iter_mut().enumerate() {
-                    let gaussian = packet * PACKET_SIZE + local;
-                    let at = place * n + gaussian;
-                    if self.shown(at) {
-                        let basis = basis::<T, B>(unit(self.dirs[at]).0);
-                        for (b, row) in basis.iter().zip(self.rows::<B>(gaussian)) {
-                            for c in 0..3 {
-                                color[c] += *b * row[c];
-                            }
-                        }
-                    }
-                }
-            }
+        let pieces = by_packet(&mut colors, self.gaussians());
+        pieces.into_par_iter().enumerate().for_each(|(packet, colors)| {
+            self.level.run(Evaluate::<T, B> {
+                sums: self,
+                first: packet * PACKET_SIZE,
+                colors,
+            });
         });
         colors
     }
@@ -112,7 +110,6 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
     fn vjp_bands<const B: usize>(&self, v_colors: &[[T; 3]], out: &mut HarmonicsGradients<T>) {
         let n = self.gaussians();
         let packets = n.div_ceil(PACKET_SIZE);
-        let places = self.dirs.len().checked_div(n).unwrap_or(0);
         let mut v_dirs = by_packet(&mut out.dirs, n);
         v_dirs.resize_with(packets, Vec::new);
         let mut v_coefficients: Vec<&mut [T]> = out
@@ -121,44 +118,178 @@ impl<'a, T: Real> HarmonicSums<'a, T> {
             .collect();
         v_coefficients.resize_with(packets, || &mut []);
         (v_dirs, v_coefficients).into_par_iter().enumerate().for_each(
-            |(packet, (mut v_dirs, v_coefficients))| {
-                let first = packet * PACKET_SIZE;
-                for gaussian in first..(first + PACKET_SIZE).min(n) {
-                    let local = gaussian - first;
-                    let rows = self.rows::<B>(gaussian);
-                    for place in 0..places {
-                        let at = place * n + gaussian;
-                        let v = v_colors[at];
-                        // A Gaussian that no pixel sees has no gradient, and its coefficients need not be read.
-                        if !self.shown(at) || v == [T::ZERO; 3] {
-                            continue;
-                        }
-                        let (direction, inverse_length) = unit(self.dirs[at]);
-                        if let Some(sums) = v_coefficients.get_mut(local * 3 * self.bases..) {
-                            let basis = basis::<T, B>(direction);
-                            for (b, sums) in basis.iter().zip(sums.as_chunks_mut::<3>().0) {
-                                for c in 0..3 {
-                                    sums[c] += *b * v[c];
-                                }
-                            }
-                        }
-                        if let Some(v_dirs) = v_dirs.get_mut(place) {
-                            let mut v_basis = [T::ZERO; B];
-                            for (v_b, row) in v_basis.iter_mut().zip(rows) {
-                                *v_b = row[0] * v[0] + row[1] * v[1] + row[2] * v[2];
-                            }
-                            let v_unit = basis_vjp(direction, &v_basis);
-                            let radial = direction[0] * v_unit[0]
-                                + direction[1] * v_unit[1]
-                                + direction[2] * v_unit[2];
-                            v_dirs[local] =
-                                [0, 1, 2].map(|i| inverse_length * (v_unit[i] - direction[i] * radial));
-                        }
-                    }
-                }
+            |(packet, (v_dirs, v_coefficients))| {
+                self.level.run(Vjp::<T, B> {
+                    sums: self,
+                    v_colors,
+                    first: packet * PACKET_SIZE,
+                    v_dirs,
+                    v_coefficients,
+                });
             },
         );
     }
+}
+
+/// The colours of a packet of Gaussians, place by place.
+struct Evaluate<'a, T, const B: usize> {
+    sums: &'a HarmonicSums<'a, T>,
+    first: usize,
+    colors: Vec<&'a mut [[T; 3]]>,
+}
+
+impl<T: Real, const B: usize> Work for Evaluate<'_, T, B> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let (sums, n) = (self.sums, self.sums.gaussians());
+        for (place, colors) in self.colors.into_iter().enumerate() {
+            for (part, colors) in colors.chunks_mut(LANES).enumerate() {
+                let gaussian = self.first + part * LANES;
+                let at = place * n + gaussian;
+                let basis = basis_of::<T, B>(&Units::new(&sums.dirs[at..at + colors.len()]));
+                for (lane, color) in colors.iter_mut().enumerate() {
+                    if sums.shown(at + lane) {
+                        for (column, row) in basis.iter().zip(sums.rows::<B>(gaussian + lane)) {
+                            for c in 0..3 {
+                                color[c] += column[lane] * row[c];
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The gradients of a packet of Gaussians.
+struct Vjp<'a, T, const B: usize> {
+    sums: &'a HarmonicSums<'a, T>,
+    v_colors: &'a [[T; 3]],
+    first: usize,
+    v_dirs: Vec<&'a mut [[T; 3]]>,
+    v_coefficients: &'a mut [T],
+}
+
+impl<T: Real, const B: usize> Work for Vjp<'_, T, B> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(mut self, _: S) {
+        let (sums, n) = (self.sums, self.sums.gaussians());
+        let places = sums.dirs.len().checked_div(n).unwrap_or(0);
+        let end = (self.first + PACKET_SIZE).min(n);
+        for gaussian in (self.first..end).step_by(LANES) {
+            let (local, count) = (gaussian - self.first, LANES.min(end - gaussian));
+            for place in 0..places {
+                let at = place * n + gaussian;
+                // A Gaussian that no pixel sees has no gradient, and its coefficients need not be read.
+                let wanted: [bool; LANES] = std::array::from_fn(|lane| {
+                    lane < count && sums.shown(at + lane) && self.v_colors[at + lane] != [T::ZERO; 3]
+                });
+                if !wanted.contains(&true) {
+                    continue;
+                }
+                let units = Units::new(&sums.dirs[at..at + count]);
+                if !self.v_coefficients.is_empty() {
+                    let basis = basis_of::<T, B>(&units);
+                    for lane in (0..count).filter(|&lane| wanted[lane]) {
+                        let (v, own) = (self.v_colors[at + lane], (local + lane) * 3 * sums.bases);
+                        let rows = self.v_coefficients[own..][..3 * B].as_chunks_mut::<3>().0;
+                        for (column, row) in basis.iter().zip(rows) {
+                            for c in 0..3 {
+                                row[c] += column[lane] * v[c];
+                            }
+                        }
+                    }
+                }
+                if let Some(v_dirs) = self.v_dirs.get_mut(place) {
+                    let mut v_basis = [[T::ZERO; LANES]; B];
+                    for lane in (0..count).filter(|&lane| wanted[lane]) {
+                        let v = self.v_colors[at + lane];
+                        for (column, row) in v_basis.iter_mut().zip(sums.rows::<B>(gaussian + lane)) {
+                            column[lane] = row[0] * v[0] + row[1] * v[1] + row[2] * v[2];
+                        }
+                    }
+                    let found = units.vjp(&v_basis);
+                    for lane in (0..count).filter(|&lane| wanted[lane]) {
+                        v_dirs[local + lane] = [found[0][lane], found[1][lane], found[2][lane]];
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Directions of some vectors, and the reciprocals of their lengths; zeros for the zero vector.
+struct Units<T> {
+    axes: [Column<T>; 3],
+    inverse_lengths: Column<T>,
+}
+
+impl<T: Real> Units<T> {
+    #[inline(always)]
+    fn new(vectors: &[[T; 3]]) -> Self {
+        let mut axes = [[T::ZERO; LANES]; 3];
+        for (lane, vector) in vectors.iter().enumerate().take(LANES) {
+            for i in 0..3 {
+                axes[i][lane] = vector[i];
+            }
+        }
+        let mut inverse_lengths = [T::ZERO; LANES];
+        for lane in 0..LANES {
+            let v = [axes[0][lane], axes[1][lane], axes[2][lane]];
+            // Divided by the largest part first, so that no square leaves the scalar's range.
+            let largest = v[0].abs().greater(v[1].abs()).greater(v[2].abs());
+            let none = largest == T::ZERO;
+            let divisor = if none { T::ONE } else { largest };
+            let v = [v[0] / divisor, v[1] / divisor, v[2] / divisor];
+            let square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+            let inverse = T::ONE / (if none { T::ONE } else { square }).sqrt();
+            for i in 0..3 {
+                axes[i][lane] = v[i] * inverse;
+            }
+            inverse_lengths[lane] = if none { T::ZERO } else { inverse / largest };
+        }
+        Self {
+            axes,
+            inverse_lengths,
+        }
+    }
+
+    #[inline(always)]
+    fn at(&self, lane: usize) -> [T; 3] {
+        [self.axes[0][lane], self.axes[1][lane], self.axes[2][lane]]
+    }
+
+    /// From gradients of the basis to those of the vectors, at right angles to each.
+    #[inline(always)]
+    fn vjp<const B: usize>(&self, v_basis: &[Column<T>; B]) -> [Column<T>; 3] {
+        let mut out = [[T::ZERO; LANES]; 3];
+        for lane in 0..LANES {
+            let direction = self.at(lane);
+            let v_unit = basis_vjp::<T, B>(direction, &std::array::from_fn(|b| v_basis[b][lane]));
+            let radial = direction[0] * v_unit[0] + direction[1] * v_unit[1] + direction[2] * v_unit[2];
+            for i in 0..3 {
+                out[i][lane] = self.inverse_lengths[lane] * (v_unit[i] - direction[i] * radial);
+            }
+        }
+        out
+    }
+}
+
+/// The first B basis functions at some directions.
+#[inline(always)]
+fn basis_of<T: Real, const B: usize>(units: &Units<T>) -> [Column<T>; B] {
+    let mut out = [[T::ZERO; LANES]; B];
+    for lane in 0..LANES {
+        let values = basis::<T, B>(units.at(lane));
+        for b in 0..B {
+            out[b][lane] = values[b];
+        }
+    }
+    out
 }
 
 /// For each packet of Gaussians, its part of every place.
@@ -176,17 +307,4 @@ fn by_packet<U>(values: &mut [U], gaussians: usize) -> Vec<Vec<&mut [U]>> {
         }
     }
     packets
-}
-
-/// The direction of a vector and the reciprocal of its length; zeros for the zero vector.
-#[inline(always)]
-fn unit<T: Real>(v: [T; 3]) -> ([T; 3], T) {
-    // Divided by the largest part first, so that no square leaves the scalar's range.
-    let largest = v[0].abs().greater(v[1].abs()).greater(v[2].abs());
-    if largest == T::ZERO {
-        return ([T::ZERO; 3], T::ZERO);
-    }
-    let v = v.map(|x| x / largest);
-    let inverse = T::ONE / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-    (v.map(|x| x * inverse), inverse / largest)
 }

@@ -4,7 +4,7 @@
 
 use crate::error::RasterError;
 use crate::input::camera::{Camera, Intrinsics};
-use crate::input::gaussians::Gaussians;
+use crate::input::gaussians::{Gaussians, check_finite};
 use crate::math::covariance::{cross, dot, three};
 use crate::math::real::Real;
 
@@ -118,7 +118,8 @@ impl<T: GlamTypes> Camera<T> {
     /// A camera at `eye` that has `target` in its middle and `up` upwards.
     ///
     /// # Errors
-    /// A target at the eye, an `up` along the view, and as [`Camera::new`].
+    /// A vector that is not finite, a target at the eye or so far off that numbers end, an `up` along the view, and as
+    /// [`Camera::new`].
     pub fn look_at(
         eye: T::Vec3,
         target: T::Vec3,
@@ -128,9 +129,13 @@ impl<T: GlamTypes> Camera<T> {
         height: usize,
     ) -> Result<Self, RasterError> {
         let (eye, target, up) = (T::from_vec3(eye), T::from_vec3(target), T::from_vec3(up));
+        for (name, vector) in [("eye", eye), ("target", target), ("up", up)] {
+            check_finite(name, &vector)?;
+        }
         let bad = |reason| RasterError::BadCamera { reason };
-        let forward = normalized(three(|i| target[i] - eye[i]))
-            .ok_or_else(|| bad("expected a target away from the eye, found one at it"))?;
+        let forward = normalized(three(|i| target[i] - eye[i])).ok_or_else(|| {
+            bad("expected a target at a distance from the eye that is neither 0 nor beyond the scalar's range")
+        })?;
         let up = normalized(up).ok_or_else(|| bad("expected an upward direction, found none"))?;
         let across = cross(forward, up);
         if !(dot(across, across) > T::of(1e-10)) {
@@ -162,7 +167,7 @@ impl<T: GlamTypes> Camera<T> {
     /// the order x, y, z, x. At an elevation of a quarter turn the azimuth still says which way is up in the image.
     ///
     /// # Errors
-    /// An `up` of length 0, and as [`Camera::new`].
+    /// A number that is not finite, an `up` of length 0, and as [`Camera::new`].
     pub fn orbit(
         target: T::Vec3,
         distance: T,
@@ -172,6 +177,10 @@ impl<T: GlamTypes> Camera<T> {
         width: usize,
         height: usize,
     ) -> Result<Self, RasterError> {
+        check_finite("target", &T::from_vec3(target))?;
+        check_finite("distance", &[distance])?;
+        check_finite("angles", &[azimuth, elevation])?;
+        check_finite("up", &T::from_vec3(up))?;
         let axis = normalized(T::from_vec3(up)).ok_or(RasterError::BadCamera {
             reason: "expected an upward direction, found none",
         })?;
@@ -314,6 +323,29 @@ mod tests {
             let refused = Camera::look_at(eye, target, up, K, 16, 16);
             assert!(matches!(refused, Err(RasterError::BadCamera { .. })));
         }
+    }
+
+    #[test]
+    fn places_that_are_not_finite_are_told_by_name() {
+        let (nan, far) = (DVec3::NAN, DVec3::splat(f64::INFINITY));
+        let refused = |name| Err(RasterError::NotFinite { name, index: 0 });
+        let (origin, z, y) = (DVec3::ZERO, DVec3::Z, DVec3::Y);
+        assert_eq!(Camera::look_at(nan, z, y, K, 16, 16), refused("eye"));
+        assert_eq!(Camera::look_at(origin, far, y, K, 16, 16), refused("target"));
+        assert_eq!(Camera::look_at(origin, z, nan, K, 16, 16), refused("up"));
+        assert_eq!(Camera::orbit(far, 1.0, [0.0; 2], y, K, 16, 16), refused("target"));
+        assert_eq!(
+            Camera::orbit(z, f64::NAN, [0.0; 2], y, K, 16, 16),
+            refused("distance")
+        );
+        assert_eq!(
+            Camera::orbit(z, 1.0, [f64::INFINITY, 0.0], y, K, 16, 16),
+            refused("angles")
+        );
+        assert_eq!(Camera::orbit(z, 1.0, [0.0; 2], nan, K, 16, 16), refused("up"));
+        // Finite places further apart than numbers reach.
+        let beyond = Camera::look_at(DVec3::splat(1e308), DVec3::splat(-1e308), y, K, 16, 16);
+        assert!(matches!(beyond, Err(RasterError::BadCamera { .. })));
     }
 
     #[test]
