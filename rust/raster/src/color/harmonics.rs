@@ -151,11 +151,13 @@ impl<T: Real, const B: usize> Work for Evaluate<'_, T, B> {
                 let basis = basis_of::<T, B>(&Units::new(&sums.dirs[at..at + colors.len()]));
                 for (lane, color) in colors.iter_mut().enumerate() {
                     if sums.shown(at + lane) {
+                        let mut sum = [T::ZERO; 3];
                         for (column, row) in basis.iter().zip(sums.rows::<B>(gaussian + lane)) {
                             for c in 0..3 {
-                                color[c] += column[lane] * row[c];
+                                sum[c] += column[lane] * row[c];
                             }
                         }
+                        *color = sum;
                     }
                 }
             }
