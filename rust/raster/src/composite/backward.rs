@@ -1,5 +1,4 @@
 //! The vjp of `composite`: from the gradient of an image to one of each splat in each tile.
-#![allow(unsafe_code)]
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -71,6 +70,7 @@ pub(crate) fn composite_vjp<T: Vectors>(
             let mut skipped = true;
             while task.first < total {
                 // SAFETY: every intersection has a number of its own and belongs to one tile, and a tile to one thread.
+                #[allow(unsafe_code)]
                 let gradients = unsafe { values.pieces(size) };
                 let any = level.run(Load {
                     incoming,
