@@ -38,7 +38,7 @@ from bigs.metrics.shape import ShapeScore, shape_score
 from bigs.models.object_detail import split_object
 from bigs.raster.settings import RasterSettings
 from bigs.train.plan.config import GuidanceStage
-from bigs.train.unseen.guided import coverage_of, follow, guide_object
+from bigs.train.unseen.prior_descent import coverage_of, follow, guide_object
 
 # Seeds of the objects to learn from begin at 0, those of the others here.
 HELD_OUT = 10_000

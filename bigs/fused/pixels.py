@@ -21,7 +21,7 @@ class TogetherTerms(NamedTuple):
 
     image: Tensor  # [] `masked_l1` over the foreground
     mse: Tensor  # [] `masked_mse` over the foreground
-    spill: Tensor  # [] `spilled` where nothing is
+    alpha_outside: Tensor  # [] `alpha_outside_masks` where nothing is
     labels: Tensor  # [] `label_difference` of the label channels; 0 without any
 
 

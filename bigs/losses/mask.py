@@ -17,7 +17,7 @@ def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
     return (pred.abs() * outside[..., None]).sum() / (outside.sum() * pred.shape[-1]).clamp_min(1.0)
 
 
-def spilled(alphas: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:
+def alpha_outside_masks(alphas: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:
     """Squared alpha where nothing is, per pixel of the masks.
 
     A mean over the outside would count a pixel there the less the more of them there are, and Gaussians that

@@ -14,8 +14,8 @@ from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.grasps import Grasps
 from bigs.models.hand_splats import HandSplats, pose_splats
 from bigs.models.lighting import Lighting
-from bigs.models.moments import Moments
 from bigs.models.object_splats import ObjectSplats
+from bigs.models.posed_scene import PosedScene
 from bigs.models.poses import HandFrames, HandPoses, ObjectPoses
 from bigs.types import SIDES, Entity, Gaussians, Side
 
@@ -127,9 +127,9 @@ class Scene(nn.Module):
             result[entity] = evaluated[owner]
         return result
 
-    def at(self, frames: Tensor) -> Moments:
+    def at(self, frames: Tensor) -> PosedScene:
         """Hands and object at `frames` [B]."""
-        return Moments(self, frames)
+        return PosedScene(self, frames)
 
     def posed_hand(self, side: Side, poses: HandFrames, hand: CanonicalHand) -> Gaussians:
         """Any Gaussians of the canonical hand in any poses of a side [B], unlit, in camera space."""

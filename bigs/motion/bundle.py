@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from bigs.motion.schur import Sightings, System, linearise, point_steps, reduce, sort_sightings
+from bigs.motion.schur import Observations, System, linearise, point_steps, reduce, sort_observations
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Bundle(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """Poses that were known before, and how well; they hold what the sightings leave open, the gauge too."""
+    """Poses known before, and how well; they hold what the observations leave open, the gauge too."""
 
     rotations: np.ndarray  # [T, 3, 3] object to camera
     transl: np.ndarray  # [T, 3]
@@ -105,7 +105,7 @@ def adjust(
 def pose_covariances(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor: Anchor) -> np.ndarray:
     """Covariance [T, 6, 6] of each frame's turn (radians) and shift (the unit of `transl`).
 
-    To first order, from sightings, motion prior and anchor. A turn, shift or growth of the object's frame
+    To first order, from observations, motion prior and anchor. A turn, shift or growth of the object's frame
     itself has no part in it: it changes all poses alike and leaves the pictures alone.
     """
     frames = len(bundle.rotations)
@@ -145,7 +145,7 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
 class _Problem(NamedTuple):
     """What stays the same from step to step."""
 
-    seen: Sightings
+    seen: Observations
     free: np.ndarray  # [T] bool, frames whose pose may change
     K: np.ndarray
     config: BundleConfig
@@ -155,7 +155,7 @@ class _Problem(NamedTuple):
 def _problem(
     bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray, anchor: Anchor | None
 ) -> _Problem:
-    seen = sort_sightings(bundle.frame, bundle.point, bundle.pixels, free)
+    seen = sort_observations(bundle.frame, bundle.point, bundle.pixels, free)
     return _Problem(seen, free, K, config, anchor)
 
 

@@ -125,7 +125,7 @@ def as_models_say(map_: ObjectMap, t: int, step: int, models: Sequence[PartialMo
 def best_start(
     map_: ObjectMap, t: int, frames: np.ndarray, starts: Sequence[_Pose], coarse: BundleConfig
 ) -> _Pose:
-    """The start of frame `t` from which the sightings of known points fit best; of equals the first.
+    """The start of frame `t` from which the observations of known points fit best; of equals the first.
 
     Fit is counted by a loss that is fine about small errors: a side that is seen face on looks nearly the
     same whichever way it turns from there.

@@ -1,4 +1,4 @@
-"""The object's map: poses so far, points so far, and every sighting with whether it is believed."""
+"""The object's map: poses so far, points so far, and every observation with whether it is believed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bigs.motion.tracks import Tracks
 
 @dataclass(frozen=True)
 class MapConfig:
-    """What counts as a sighting, and how more of them are found; lengths in pixels of the clip's images."""
+    """What counts as an observation, and how more are found; lengths in pixels of the clip's images."""
 
     # An observation further than this from its point's projection is wrong.
     keep_error: float = 2.0
     # A point needs this many observations, and rays that differ by this angle, degrees.
-    least_sightings: int = 3
+    least_observations: int = 3
     least_angle: float = 2.0
     # Known points are searched within this distance of their projection, ...
     search_radius: float = 5.0
@@ -33,12 +33,12 @@ class MapConfig:
 
 
 class ObjectMap:
-    """Poses and points so far, and every sighting with whether it is believed."""
+    """Poses and points so far, and every observation with whether it is believed."""
 
     def __init__(
         self, features: Sequence[FrameFeatures], tracks: Tracks, K: np.ndarray, config: MapConfig
     ) -> None:
-        """A map without poses and points; `tracks` hold the sightings of `features`, one entry per frame."""
+        """A map without poses and points; `tracks` join the observations of `features`, one per frame."""
         self.features, self.K, self.config = features, K, config
         # Given poses of all frames; None if there are only pictures.
         self.anchor: Anchor | None = None
@@ -55,7 +55,7 @@ class ObjectMap:
         self.known = np.zeros(tracks.total, dtype=bool)  # which points have been triangulated
 
     def restart(self, frames: np.ndarray, rotations: np.ndarray, transl: np.ndarray) -> None:
-        """Forget all poses and points, believe every sighting, and start from the given frames' poses."""
+        """Forget all poses and points, believe every observation, and start from the given frames' poses."""
         self.posed[:] = False
         self.rotations[frames], self.transl[frames] = rotations, transl
         self.posed[frames] = True
@@ -84,30 +84,30 @@ class ObjectMap:
         self.triangulate()
 
     def misfit(self) -> float:
-        """Mean over the sightings in posed frames of the squared error in pixels, cut off at `keep_error`.
+        """Mean over the observations in posed frames of the squared error in pixels, cut off at `keep_error`.
 
-        Counted are the tracks that could have a point: those with `least_sightings` in posed frames.
+        Counted are the tracks that could have a point: those with `least_observations` in posed frames.
         """
         _, error = self._errors()
         return float((error**2).mean()) if len(error) else np.inf
 
     def losses(self) -> np.ndarray:
-        """Geman-McClure losses of the same sightings, added up by track [N]; 1 for one that fits nowhere."""
+        """Geman-McClure losses of the same observations, summed by track [N]; 1 for one that fits nowhere."""
         track, error = self._errors()
         squared = (error / (0.25 * self.config.keep_error)) ** 2
         return np.bincount(track, squared / (1.0 + squared), minlength=len(self.points))
 
     def _errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Tracks and errors [M] in pixels, at most `keep_error`, of the sightings that `misfit` counts."""
+        """Tracks and errors [M] in pixels, at most `keep_error`, of the observations that `misfit` counts."""
         rows = self.posed[self.frame]
         seen = np.bincount(self.track[rows], minlength=len(self.points))
-        rows &= seen[self.track] >= self.config.least_sightings
+        rows &= seen[self.track] >= self.config.least_observations
         error = np.linalg.norm(self.reproject(rows) - self.pixels[rows], axis=1)
         error[~self.known[self.track[rows]]] = np.inf
         return self.track[rows], np.minimum(error, self.config.keep_error)
 
     def use(self) -> np.ndarray:
-        """Sightings [M] (bool) of known points, believed, in frames with a pose."""
+        """Observations [M] (bool) of known points, believed, in frames with a pose."""
         return self.good & self.known[self.track] & self.posed[self.frame]
 
     def triangulate(self) -> None:
@@ -119,7 +119,7 @@ class ObjectMap:
             error[rows] = np.linalg.norm(self._project(points, rows) - self.pixels[rows], axis=1)
             rows &= (error < self.config.keep_error) & fine[self.track]
         seen = np.bincount(self.track[rows], minlength=len(self.points))
-        new = fine & (seen >= self.config.least_sightings) & ~self.known
+        new = fine & (seen >= self.config.least_observations) & ~self.known
         self.points[new] = points[new]
         self.known |= new
         tried = self.posed[self.frame] & new[self.track]
@@ -145,7 +145,7 @@ class ObjectMap:
         return np.linalg.solve(matrix, right[..., None])[..., 0], fine
 
     def _rays(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Camera centres and unit viewing rays [m, 3] of sightings, in the object frame."""
+        """Camera centres and unit viewing rays [m, 3] of observations, in the object frame."""
         rotation, transl = self.rotations[self.frame[rows]], self.transl[self.frame[rows]]
         cam = np.concatenate([self.pixels[rows], np.ones((int(rows.sum()), 1))], axis=1)
         cam = cam @ np.linalg.inv(self.K).T
@@ -153,7 +153,7 @@ class ObjectMap:
         return -np.einsum("mji,mj->mi", rotation, transl), direction
 
     def reproject(self, rows: np.ndarray) -> np.ndarray:
-        """Where the points of the sightings `rows` [M] (bool) appear in their frames, [m, 2] pixels."""
+        """Where the points of the observations `rows` [M] (bool) appear in their frames, [m, 2] pixels."""
         return self._project(self.points, rows)
 
     def _project(self, points: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -163,15 +163,15 @@ class ObjectMap:
         return cam[:, :2] / depth[:, None] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
 
     def judge(self) -> None:
-        """Believe the sightings near their point's projection; forget points with fewer than two left."""
+        """Believe the observations near their point's projection; forget points with fewer than two left."""
         rows = self.known[self.track] & self.posed[self.frame]
         error = np.linalg.norm(self.reproject(rows) - self.pixels[rows], axis=1)
         self.good[rows] = error < self.config.keep_error
         seen = np.bincount(self.track[self.use()], minlength=len(self.points))
         self.known &= seen >= 2
 
-    def replace_sightings(self, frame: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> None:
-        """Take other sightings instead: [M], [M] and [M, 2]. They are no features, so `search` knows none."""
+    def replace_observations(self, frame: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> None:
+        """Take other observations: [M], [M] and [M, 2]. They are no features, so `search` knows none."""
         self.frame, self.track, self.pixels = frame, track, pixels
         self.feature = np.full(len(frame), -1)
         self.good = np.ones(len(frame), dtype=bool)
@@ -206,7 +206,7 @@ class ObjectMap:
         self.points[tracks] = bundle.points
 
     def search(self, t: int) -> int:
-        """Look in frame `t` for known points that should be there; the number of sightings found."""
+        """Look in frame `t` for known points that should be there; the number of observations found."""
         features, config = self.features[t], self.config
         if len(features.pixels) == 0:
             return 0
@@ -253,7 +253,7 @@ class ObjectMap:
         Args:
             t: the frame.
             tracks: [m] known points.
-            speaks: [m] the sighting of each that its descriptor is taken from.
+            speaks: [m] the observation of each that its descriptor is taken from.
             pixels: [m, 2] where they should appear.
             free: features that show no known point yet.
         """

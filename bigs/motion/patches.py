@@ -2,7 +2,7 @@
 
 A feature is found again over some thirty degrees of turn, so that a map of features is a chain of short
 links and drifts. Once a map is there, it tells how the surface about a point looks from anywhere: the patch
-about its most frontal sighting, warped as its plane turns, is laid on every other frame and moved to where
+about its most frontal observation, warped as its plane turns, is laid on every other frame and moved to where
 it fits best. So a point is seen for as long as its side shows, before and after a hand hid it, and always by
 the same patch, which does not drift.
 """
@@ -50,7 +50,7 @@ class PatchConfig:
     passes: int = 3
 
 
-class Sightings(NamedTuple):
+class Observations(NamedTuple):
     """Which point was seen where."""
 
     frame: np.ndarray  # [M]
@@ -67,7 +67,7 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         config: see there.
     """
     use = map_.use()
-    found = matched = Sightings(map_.frame[use], map_.track[use], map_.pixels[use])
+    found = matched = Observations(map_.frame[use], map_.track[use], map_.pixels[use])
     frames = np.arange(len(map_.posed))
     everything = np.ones(len(frames), dtype=bool)
     for _ in range(config.passes):
@@ -77,22 +77,24 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         found = measured
         # Most matches whose patch was not recognised are wrong, but a frame may have nothing else.
         poor = np.bincount(found.frame, minlength=len(frames)) < config.enough
-        map_.replace_sightings(*_united(found, matched, poor))
+        map_.replace_observations(*_united(found, matched, poor))
         map_.judge()
         map_.adjust(frames, everything, map_.config.bundle)
         map_.judge()
     # Where they agree with these poses they are kept, since they connect frames.
-    map_.replace_sightings(*_united(found, matched, everything))
+    map_.replace_observations(*_united(found, matched, everything))
     map_.judge()
     map_.triangulate()
 
 
-def _united(found: Sightings, matched: Sightings, frames: np.ndarray) -> Sightings:
-    """The sightings `found`, and those of `matched` in `frames` [T] (bool) whose patches were not."""
-    total = 1 + max(sightings.track.max(initial=0) for sightings in (found, matched))
+def _united(found: Observations, matched: Observations, frames: np.ndarray) -> Observations:
+    """The observations `found`, and those of `matched` in `frames` [T] (bool) whose patches were not."""
+    total = 1 + max(observations.track.max(initial=0) for observations in (found, matched))
     missed = ~np.isin(matched.frame * total + matched.track, found.frame * total + found.track)
     missed &= frames[matched.frame]
-    return Sightings(*(np.concatenate([new, old[missed]]) for new, old in zip(found, matched, strict=True)))
+    return Observations(
+        *(np.concatenate([new, old[missed]]) for new, old in zip(found, matched, strict=True))
+    )
 
 
 class Pictures:
@@ -135,8 +137,8 @@ class Templates(NamedTuple):
 
 
 def _measured(
-    map_: ObjectMap, matched: Sightings, pictures: Pictures, config: PatchConfig
-) -> Sightings | None:
+    map_: ObjectMap, matched: Observations, pictures: Pictures, config: PatchConfig
+) -> Observations | None:
     """Where the known points of `matched` are seen, by their patches; None if there are too few points."""
     known = map_.known[matched.track]
     tracks, point = np.unique(matched.track[known], return_inverse=True)
@@ -167,11 +169,11 @@ def _measured(
         start, warp = _warps(map_, t, own[rows], points[rows], normals[rows])
         laid = lay(pictures, t, start, warp, Templates(*(part[rows] for part in templates)), config)
         rows = rows[laid.fits]
-        found.append(Sightings(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits]))
+        found.append(Observations(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits]))
     # A patch's own observation counts as recognised if it was recognised elsewhere.
-    again = np.isin(tracks, np.concatenate([sightings.track for sightings in found]))
-    found.append(Sightings(own[again], tracks[again], middle[again]))
-    return Sightings(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    again = np.isin(tracks, np.concatenate([observations.track for observations in found]))
+    found.append(Observations(own[again], tracks[again], middle[again]))
+    return Observations(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
 def cut_templates(pictures: Pictures, own: np.ndarray, middle: np.ndarray, config: PatchConfig) -> Templates:

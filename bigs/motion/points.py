@@ -25,7 +25,7 @@ def normalisation(points: np.ndarray) -> np.ndarray:
 
 
 def color_points(map_: ObjectMap, tracks: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:
-    """Colours [N, 3] uint8 of the points `tracks` [N]: the median over their sightings' pixels."""
+    """Colours [N, 3] uint8 of the points `tracks` [N]: the median over their observations' pixels."""
     slot = np.full(len(map_.points), -1)
     slot[tracks] = np.arange(len(tracks))
     rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))

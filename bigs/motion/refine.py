@@ -1,9 +1,9 @@
 """A grown map rebuilt from its poses, and with parts of it at the poses of other partial models.
 
 Growing decides early what is a point and what a stray, and bends where little was seen. Adjusted once more
-from its poses alone, with every sighting believed again, the map forgets that. Where it crossed few sightings
-it may still be bent; a partial model of the frames beyond, made without crossing them, is then the better
-start.
+from its poses alone, with every observation believed again, the map forgets that. Where it crossed few
+observations it may still be bent; a partial model of the frames beyond, made without crossing them, is then
+the better start.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A point that F frames see couples all of them: its part of the poses' equations has 36 F² numbers. Points are
 taken in batches that are seen in much the same frames. The couplings of a batch fill one dense matrix, and
 the product of that with itself, which a BLAS makes at full speed, is the batch's part. Within a batch each
-number of a small matrix is an array over the sightings, since numpy spends more time on starting products of
-small matrices than on these.
+number of a small matrix is an array over the observations, since numpy spends more time on starting products
+of small matrices than on these.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _BATCH = 8_000
 _Numbers = Sequence[np.ndarray] | np.ndarray  # coordinates of a vector or of a row, each [m]
 
 
-class Sightings(NamedTuple):
-    """What was seen where, by points of which all sightings are consecutive."""
+class Observations(NamedTuple):
+    """What was seen where, by points of which all observations are consecutive."""
 
     order: np.ndarray  # [M] index of each among the caller's observations
     frame: np.ndarray  # [M]
@@ -32,7 +32,7 @@ class Sightings(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """Some points with all their sightings."""
+    """Some points with all their observations."""
 
     rows: slice  # range of observations
     points: slice  # range of ranks
@@ -67,8 +67,10 @@ class Reduced(NamedTuple):
     inverses: list[np.ndarray]  # [n, 3, 3] of each batch's points
 
 
-def sort_sightings(frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, free: np.ndarray) -> Sightings:
-    """Sightings [M] in batches of points that are first seen in about the same frame.
+def sort_observations(
+    frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, free: np.ndarray
+) -> Observations:
+    """Observations [M] in batches of points that are first seen in about the same frame.
 
     Args:
         frame, point, pixels: [M], [M] and [M, 2].
@@ -98,11 +100,11 @@ def sort_sightings(frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, fre
         starts = np.concatenate([[row], ends[began : until - 1]]) - row
         batches.append(_Batch(rows, slice(began, until), starts, here, used, slot, rank[rows][here] - began))
         began, row = until, rows.stop
-    return Sightings(order, frame, rank, np.ascontiguousarray(pixels[order].T), points[by_time], batches)
+    return Observations(order, frame, rank, np.ascontiguousarray(pixels[order].T), points[by_time], batches)
 
 
 def linearise(
-    seen: Sightings,
+    seen: Observations,
     rotations: np.ndarray,
     transl: np.ndarray,
     points: np.ndarray,
@@ -188,7 +190,7 @@ def _add_poses(
 ) -> None:
     """Add to the lower half of the poses' blocks [6, 6, F], and to their gradient [6, F], in place.
 
-    `slot` [m] is the pose of each sighting, `arm` the spoke from the object's origin to what was seen.
+    `slot` [m] is the pose of each observation, `arm` the spoke from the object's origin to what was seen.
     """
     sums = lambda values: np.bincount(slot, values, poses.shape[2])  # noqa: E731
     levers = [_cross(arm, row) for row in hessian]  # of a shift relative to a rotation
@@ -203,7 +205,7 @@ def _add_poses(
             poses[3 + i, 3 + j] += sums(hessian[i][j])
 
 
-def reduce(system: System, seen: Sightings, damping: float) -> Reduced:
+def reduce(system: System, seen: Observations, damping: float) -> Reduced:
     """Eliminate the points, after Levenberg's and Marquardt's `damping` of all equations."""
     frames = len(system.pose_gradient) // 6
     matrix = system.poses.copy()
@@ -238,7 +240,7 @@ def reduce(system: System, seen: Sightings, damping: float) -> Reduced:
     return Reduced(matrix, gradient, inverses)
 
 
-def point_steps(system: System, reduced: Reduced, seen: Sightings, change: np.ndarray) -> np.ndarray:
+def point_steps(system: System, reduced: Reduced, seen: Observations, change: np.ndarray) -> np.ndarray:
     """How far every point [P, 3] goes, by rank, when the poses go by `change` [F, 6]."""
     steps = np.zeros((len(seen.points), 3))
     for batch, part, inverse in zip(seen.batches, system.parts, reduced.inverses, strict=True):

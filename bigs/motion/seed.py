@@ -92,7 +92,7 @@ def evidence(
     """By how many standard deviations consecutive `frames` fit better at `poses` than at `others`.
 
     Both are adjusted by themselves, and the tracks' losses compared one by one: what fits neither, as many
-    sightings do on plain objects, says nothing, and many tracks that say a little say it surely. 0 if no
+    observations do on plain objects, says nothing, and many tracks that say a little say it surely. 0 if no
     track fits either. `map_` is changed; give a copy.
 
     Returns:

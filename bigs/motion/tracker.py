@@ -67,7 +67,7 @@ class TrackerConfig:
     # Errors of neighbouring given poses are correlated too: smoothing them alone makes them no more certain.
     given_caution: float = 3.0
     # A frame with fewer observations says nothing about the given poses' errors.
-    least_sightings: int = 30
+    least_observations: int = 30
 
 
 class GivenPoses(NamedTuple):
@@ -84,7 +84,7 @@ class TrackedMotion(NamedTuple):
     rotations: np.ndarray  # [T, 3, 3]
     transl: np.ndarray  # [T, 3]
     covariance: np.ndarray  # [T, 6, 6] of rotation (radians) and shift (metres) in the camera's axes
-    sightings: np.ndarray  # [T] number of points in each frame
+    observations: np.ndarray  # [T] number of points in each frame
     contradicted: np.ndarray  # [T] bool: matches contradict the given pose
     points: np.ndarray  # [N, 3] metres
     colors: np.ndarray  # [N, 3] uint8
@@ -145,7 +145,7 @@ def track_matches(
     )
     covariance = pose_covariances(bundle, K, uncertain, doubted)
     seen = np.bincount(map_.track[map_.use()], minlength=len(map_.points))
-    used = np.flatnonzero(map_.known & (seen >= config.map.least_sightings))
+    used = np.flatnonzero(map_.known & (seen >= config.map.least_observations))
     if len(used):
         used = used[trim_points(map_.points[used])]
     colors = color_points(map_, used, images) if len(used) else np.zeros((0, 3), dtype=np.uint8)
@@ -163,10 +163,10 @@ def track_matches(
 
 
 def _fused(map_: ObjectMap, config: TrackerConfig) -> BundleConfig:
-    """Adjust everything with the given poses, in place; what was believed of sightings in the end.
+    """Adjust everything with the given poses, in place; what was believed of observations in the end.
 
     Where few points lead across, tracks may bend and be sure of it. Given poses err, too, but not for many
-    frames by more than they ever do: then sightings are believed less, until both agree. The weakest links
+    frames by more than they ever do: then observations are believed less, until both agree. The weakest links
     give way first.
     """
     assert map_.anchor is not None
@@ -230,7 +230,7 @@ def contradicted_frames(
     given: GivenPoses,
     config: TrackerConfig,
 ) -> np.ndarray:
-    """Frames [T] (bool) whose sightings, together with those of other frames, refute their given pose.
+    """Frames [T] (bool) whose observations, together with those of other frames, refute their given pose.
 
     Each track's point is placed where most of its rays meet. Two frames agree if most tracks that they share
     have both on their point. The largest set of frames that agreement connects is believed, and so are frames
@@ -266,7 +266,7 @@ def contradicted_frames(
 def _off_their_points(
     frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, K: np.ndarray, given: GivenPoses
 ) -> np.ndarray:
-    """How far each sighting [M] is from where most rays of its track meet, pixels."""
+    """How far each observation [M] is from where most rays of its track meet, pixels."""
     rotation, transl = given.rotations[frame], given.transl[frame]
     ray = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(K).T
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -323,7 +323,7 @@ def measured_anchor(map_: ObjectMap, anchor: Anchor, config: TrackerConfig) -> A
     these change no picture.
     """
     seen = np.bincount(map_.frame[map_.use()], minlength=len(map_.posed))
-    use = (seen >= config.least_sightings) & (anchor.trust > 0.5)
+    use = (seen >= config.least_observations) & (anchor.trust > 0.5)
     if use.sum() < _FEWEST:
         return anchor
     rotations, transl = map_.rotations[use], map_.transl[use]

@@ -1,4 +1,4 @@
-"""Feature tracks: matches of pairs of frames joined into the sightings of one point."""
+"""Feature tracks: matches of pairs of frames joined into the observations of one point."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Tracks(NamedTuple):
-    """Sightings, sorted by frame; a track has at most one in a frame."""
+    """Observations, sorted by frame; a track has at most one in a frame."""
 
     frame: np.ndarray  # [M]
     feature: np.ndarray  # [M] which of the frame's features
@@ -18,7 +18,7 @@ class Tracks(NamedTuple):
 
 
 def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence[int]) -> Tracks:
-    """Sightings joined along matches, those of near frames first.
+    """Observations joined along matches, those of near frames first.
 
     A match that would bring two features of a frame into one track is wrong, or one of the matches before it
     was; it is left out.
@@ -28,7 +28,7 @@ def join_matches(matches: Mapping[tuple[int, int], np.ndarray], counts: Sequence
         counts: features of each frame.
 
     Returns:
-        Tracks of two sightings or more.
+        Tracks of two observations or more.
     """
     first = np.concatenate([[0], np.cumsum(counts)]).tolist()
     frame = np.repeat(np.arange(len(counts)), counts)

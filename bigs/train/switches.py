@@ -20,6 +20,7 @@ from bigs.train.plan.config import (
     SplitStage,
     Stage,
 )
+from bigs.train.plan.renamed import check_renamed
 
 # Rates of fields beside poses that move with them, where Gaussians are never freed.
 _FIELD_RATES = {
@@ -50,6 +51,7 @@ def without(config: RunConfig, what: str) -> RunConfig:
     Raises:
         InputError: there is no such ingredient.
     """
+    check_renamed("--without", what)
     check_choice("--without", what, SWITCHES, "ingredients and loss terms")
     return SWITCHES[what].off(config)
 

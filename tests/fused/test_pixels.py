@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
-from bigs.losses.mask import amodal_silhouette, label_difference, spilled
+from bigs.losses.mask import alpha_outside_masks, amodal_silhouette, label_difference
 from bigs.losses.photometric import masked_l1, masked_mse
 
 T, H, W, E = 5, 9, 13, 2
@@ -41,7 +41,7 @@ def together_twin(colors, alphas, images, foreground, unknown, shares, frames, c
     return TogetherTerms(
         masked_l1(colors[:, :3], images, foreground),
         masked_mse(colors[:, :3], images, foreground),
-        spilled(alphas, empty, foreground),
+        alpha_outside_masks(alphas, empty, foreground),
         label_difference(colors[:, 3:], torch.stack([share[frames][counts] for share in shares], -1))
         if shares
         else colors.new_zeros(()),

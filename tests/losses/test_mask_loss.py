@@ -1,7 +1,13 @@
 import pytest
 import torch
 
-from bigs.losses.mask import amodal_silhouette, label_difference, outside_mask, outside_mask_on, spilled
+from bigs.losses.mask import (
+    alpha_outside_masks,
+    amodal_silhouette,
+    label_difference,
+    outside_mask,
+    outside_mask_on,
+)
 
 
 def images(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -13,10 +19,12 @@ def test_a_spilled_pixel_costs_the_same_however_much_is_empty() -> None:
     foreground[:10] = 1.0
     inside, outside = torch.zeros(60, 1), torch.zeros(60, 1)
     inside[4], outside[40] = 0.5, 0.5
-    assert spilled(outside, 1.0 - foreground, foreground) == pytest.approx(0.5**2 / 10)
-    assert spilled(outside[:45], (1.0 - foreground)[:45], foreground) == pytest.approx(0.5**2 / 10)
-    assert spilled(inside, 1.0 - foreground, foreground) == 0.0
-    assert spilled(outside, torch.zeros(60), foreground) == 0.0
+    assert alpha_outside_masks(outside, 1.0 - foreground, foreground) == pytest.approx(0.5**2 / 10)
+    assert alpha_outside_masks(outside[:45], (1.0 - foreground)[:45], foreground) == pytest.approx(
+        0.5**2 / 10
+    )
+    assert alpha_outside_masks(inside, 1.0 - foreground, foreground) == 0.0
+    assert alpha_outside_masks(outside, torch.zeros(60), foreground) == 0.0
 
 
 def test_outside_mask_sees_only_the_outside() -> None:

@@ -33,7 +33,7 @@ def disturbed(bundle: Bundle, rng: np.random.Generator, frames: slice = slice(No
     return bundle._replace(rotations=rotations, transl=transl, points=points)
 
 
-def test_exact_sightings_are_met_from_a_disturbed_start(egg: TurningObject) -> None:
+def test_exact_observations_are_met_from_a_disturbed_start(egg: TurningObject) -> None:
     # With the prior all but off, the exact scene costs nothing.
     config = BundleConfig(turn_sigma=50.0, shift_sigma=1.0, iterations=60, tolerance=1e-9)
     found = adjust(disturbed(true_bundle(egg), np.random.default_rng(1)), K, config)
@@ -42,7 +42,7 @@ def test_exact_sightings_are_met_from_a_disturbed_start(egg: TurningObject) -> N
     assert rotation_errors(found.rotations, egg.rotations).max() < 0.1
 
 
-def test_wrong_sightings_hardly_move_the_poses(egg: TurningObject) -> None:
+def test_wrong_observations_hardly_move_the_poses(egg: TurningObject) -> None:
     rng = np.random.default_rng(2)
     bundle = true_bundle(egg)
     wrong = rng.random(len(bundle.pixels)) < 0.1
@@ -51,7 +51,7 @@ def test_wrong_sightings_hardly_move_the_poses(egg: TurningObject) -> None:
     assert rotation_errors(found.rotations, egg.rotations).max() < 0.2
 
 
-def test_a_frame_without_sightings_goes_where_the_motion_leads(egg: TurningObject) -> None:
+def test_a_frame_without_observations_goes_where_the_motion_leads(egg: TurningObject) -> None:
     bundle = true_bundle(egg)
     keep = ~np.isin(bundle.frame, (7, 8))
     blind = bundle._replace(frame=bundle.frame[keep], point=bundle.point[keep], pixels=bundle.pixels[keep])

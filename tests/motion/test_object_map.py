@@ -115,7 +115,7 @@ def test_growth_follows_a_motion_that_goes_back() -> None:
 
 @pytest.mark.parametrize("step", [1, -1])
 def test_growth_knows_of_a_jump_by_a_partial_model(egg: TurningObject, step: int) -> None:
-    """Whatever the model's frame and unit; and the start that the sightings meet is taken."""
+    """Whatever the model's frame and unit; and the start that the observations meet is taken."""
     found = at_truth(egg)
     t, last = 20, 20 - step
     (start,) = as_models_say(found, t, step, (egg.model(range(5, 35)), egg.model(range(20, 21))))
@@ -130,7 +130,7 @@ def test_growth_knows_of_a_jump_by_a_partial_model(egg: TurningObject, step: int
     assert best_start(found, t, frames, starts, one_step) is start
 
 
-def test_of_starts_that_meet_as_many_sightings_the_better_fit_is_taken(egg: TurningObject) -> None:
+def test_of_starts_that_meet_as_many_observations_the_better_fit_is_taken(egg: TurningObject) -> None:
     """A narrow side that turned back at its widest fitted within the limit whichever way it was to go."""
     found = at_truth(egg)
     off = Rotation.from_euler("y", 0.4, degrees=True).as_matrix() @ egg.rotations[20]
@@ -235,7 +235,7 @@ def test_what_a_model_says_before_a_kink_counts_as_what_it_says_after() -> None:
     assert spliced and rotation_errors(spliced[0].rotations, egg.rotations).max() < 1.0
 
 
-def test_a_partial_model_that_its_own_sightings_contradict_says_nothing_against_the_map(
+def test_a_partial_model_that_its_own_observations_contradict_says_nothing_against_the_map(
     egg: TurningObject,
 ) -> None:
     """Two short models of a can, 30 degrees off by themselves, flagged 28 of its right frames."""

@@ -43,14 +43,14 @@ def filmed() -> Filmed:
 def test_poses_and_points_get_better(filmed: Filmed) -> None:
     egg, found = filmed.egg, copy.deepcopy(filmed.map)
     before = rotation_errors(found.rotations, egg.rotations)
-    sightings = found.use().sum()
+    observations = found.use().sum()
     sharpen(found, Pictures(filmed.images, filmed.masks, PatchConfig()), PatchConfig())
     after = rotation_errors(found.rotations, egg.rotations)
     assert np.median(after) < 0.4 * np.median(before) and after.max() < before.max()
-    assert found.use().sum() > 1.2 * sightings
+    assert found.use().sum() > 1.2 * observations
 
 
-def test_every_sighting_is_on_the_object_and_stands_for_one_point(filmed: Filmed) -> None:
+def test_every_observation_is_on_the_object_and_stands_for_one_point(filmed: Filmed) -> None:
     masks = filmed.masks.copy()
     masks[10:14, :, : WIDTH // 2] = False  # a hand over the left half
     found = copy.deepcopy(filmed.map)
@@ -70,9 +70,9 @@ def test_pictures_of_something_else_leave_the_matches_in_force(filmed: Filmed) -
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, image.shape, dtype=np.uint8) for image in filmed.images]
     found = copy.deepcopy(filmed.map)
-    before, sightings = found.rotations.copy(), found.use().sum()
+    before, observations = found.rotations.copy(), found.use().sum()
     sharpen(found, Pictures(noise, filmed.masks, PatchConfig()), PatchConfig())
-    assert found.use().sum() > 0.9 * sightings
+    assert found.use().sum() > 0.9 * observations
     assert rotation_errors(found.rotations, before).max() < 0.5
 
 

@@ -63,7 +63,7 @@ def test_points_are_eliminated_exactly(
     free = np.ones(6, dtype=bool)
     free[list(still)] = False
     frames = int(free.sum())
-    seen = schur.sort_sightings(bundle.frame, bundle.point, bundle.pixels, free)
+    seen = schur.sort_observations(bundle.frame, bundle.point, bundle.pixels, free)
     assert (len(seen.batches) > 1) == (batch == 16)
     points = bundle.points[seen.points]
     system = schur.linearise(seen, bundle.rotations, bundle.transl, points, K, SIGMA, frames)

@@ -75,7 +75,7 @@ def test_tracks_correct_given_poses_even_gross_ones(filmed: Filmed, wrong: tuple
 def test_an_object_without_texture_keeps_its_poses(filmed: Filmed) -> None:
     given = given_poses(filmed.egg)
     found = track_matches([NOTHING] * FRAMES, {}, filmed.images, filmed.masks, K, given, CONFIG)
-    assert not found.contradicted.any() and not found.sightings.any() and len(found.points) == 0
+    assert not found.contradicted.any() and not found.observations.any() and len(found.points) == 0
     # Smoothed a little, and as uncertain as anything that nobody measured.
     assert rotation_errors(found.rotations, given.rotations).max() < 5.0
     before = rotation_errors(given.rotations, filmed.egg.rotations).mean()
@@ -155,7 +155,7 @@ def test_covariances_are_those_of_many_adjustments(little: Bundle) -> None:
     assert np.linalg.eigvalsh(covariance).min() > 0
 
 
-def test_an_anchor_holds_what_no_sighting_tells(little: Bundle) -> None:
+def test_an_anchor_holds_what_no_observation_tells(little: Bundle) -> None:
     nothing = little._replace(frame=little.frame[:0], point=little.point[:0], pixels=little.pixels[:0])
     anchor = Anchor(little.rotations, little.transl, np.ones(10), np.radians(1.0), np.full(3, 0.002))
     rng = np.random.default_rng(3)

@@ -121,7 +121,7 @@ def _measure(frames: int, points: int, seen: int, plan: AdjustmentPlan) -> dict[
         "frames": frames,
         "points": points,
         "seen": seen,
-        "sightings": len(bundle.frame),
+        "observations": len(bundle.frame),
         "cpu_seconds": cpu,
         "seconds": wall,
         "step_degrees": float(np.degrees(np.median(error))),
@@ -129,9 +129,11 @@ def _measure(frames: int, points: int, seen: int, plan: AdjustmentPlan) -> dict[
 
 
 def _table(report: dict[str, Any]) -> Table:
-    rows: Rows = [("frames", "points", "frames that see a point", "sightings", "CPU s", "wall s", "step °")]
+    rows: Rows = [
+        ("frames", "points", "frames that see a point", "observations", "CPU s", "wall s", "step °")
+    ]
     for run in report["runs"]:
-        whole = (str(run[name]) for name in ("frames", "points", "seen", "sightings"))
+        whole = (str(run[name]) for name in ("frames", "points", "seen", "observations"))
         rows.append(
             (*whole, f"{run['cpu_seconds']:.1f}", f"{run['seconds']:.1f}", f"{run['step_degrees']:.3f}")
         )

@@ -163,7 +163,7 @@ def _report_table(report: SfmReport) -> dict[str, Any]:
             "features": int(report.features[t]),
             "matches_with_next": int(report.neighbour_matches[t]),
             "model": int(report.model[t]),
-            "sightings": int(checks.sightings[t]),
+            "observations": int(checks.observations[t]),
             "uncertainty_degrees": round(float(checks.uncertainty[t]), 3),
             "mirror_evidence": round(float(checks.mirror[t]), 1),
             "turn_cosine": round(float(checks.cosine[t]), 3),

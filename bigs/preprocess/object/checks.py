@@ -27,7 +27,7 @@ class CheckConfig:
     """When a frame is flagged."""
 
     # With fewer observations, the pose is the motion prior's.
-    least_sightings: int = 8
+    least_observations: int = 8
     # Standard deviation of the rotation from the observations alone, degrees.
     most_uncertain: float = 1.0
     # Cosine between the mean angular velocities of the five frames before and after.
@@ -47,7 +47,7 @@ class CheckConfig:
 class SfmChecks(NamedTuple):
     """What was found in each frame."""
 
-    sightings: np.ndarray  # [T] number of accepted observations
+    observations: np.ndarray  # [T] number of accepted observations
     uncertainty: np.ndarray  # [T] degrees relative to the best connected frame
     mirror: np.ndarray  # [T] evidence against the mirror image in the worst window; below 0 is wrong
     cosine: np.ndarray  # [T] cosine of angular velocities before and after; 1 where nothing turns
@@ -77,14 +77,14 @@ def check_map(
 ) -> SfmChecks:
     """All checks of a map whose frames all have poses. `tracks` are those of the matches alone."""
     frames = len(map_.posed)
-    sightings = np.bincount(map_.frame[map_.use()], minlength=frames)
+    observations = np.bincount(map_.frame[map_.use()], minlength=frames)
     bundle, _ = map_.bundle(np.arange(frames))
     # The prior is nearly removed, so the observations count.
     loose = replace(map_.config.bundle, turn_sigma=3.0, shift_sigma=0.015)
     between = turn_uncertainties(bundle, map_.K, loose)
     # Of two loosely connected parts the larger one is believed.
     tied = (between <= config.most_uncertain).sum(1)
-    uncertainty = between[max(range(frames), key=lambda t: (tied[t], sightings[t]))]
+    uncertainty = between[max(range(frames), key=lambda t: (tied[t], observations[t]))]
     trial = ObjectMap(features, tracks, map_.K, MapConfig())
     mirror = _mirror_evidence(map_, trial, config.mirror_window)
     cosine = turn_cosines(map_.rotations)
@@ -104,7 +104,7 @@ def check_map(
         if not _outdone(map_, trial, part, config):
             otherwise[part.frames[degrees > config.most_disagreement]] = True
     signs = {
-        FEW: sightings < config.least_sightings,
+        FEW: observations < config.least_observations,
         LOOSE: uncertainty > config.most_uncertain,
         REVERSED: mirror < config.least_evidence,
         TURN: cosine < config.least_cosine,
@@ -112,7 +112,7 @@ def check_map(
         OTHERWISE: otherwise,
     }
     flags = [[word for word, found in signs.items() if found[t]] for t in range(frames)]
-    return SfmChecks(sightings, uncertainty, mirror, cosine, flags)
+    return SfmChecks(observations, uncertainty, mirror, cosine, flags)
 
 
 def turn_cosines(rotations: np.ndarray, reach: int = 5) -> np.ndarray:
@@ -136,7 +136,7 @@ def _step_angles(rotations: np.ndarray) -> np.ndarray:
 
 
 def _outdone(map_: ObjectMap, trial: ObjectMap, part: PartialModel, config: CheckConfig) -> bool:
-    """Whether the sightings in a part's frames, taken alone, say what the map says rather than the part."""
+    """Whether the observations in a part's frames, taken alone, agree with the map rather than the part."""
     rows = np.arange(len(part.frames))
     poses = map_.rotations[part.frames], map_.transl[part.frames]
     rotations, transl = joined(map_, part, rows)

@@ -245,7 +245,7 @@ def _report(
         models=models,
         model=model,
         checks=SfmChecks(
-            pad(checks.sightings, 0),
+            pad(checks.observations, 0),
             pad(checks.uncertainty, 180.0),
             pad(checks.mirror, 0.0),
             pad(checks.cosine, 1.0),
@@ -261,19 +261,19 @@ def _result(
 ) -> ObjectSfm:
     """The outcome over the whole clip, of which the map's frames start at `first`."""
     seen = np.bincount(map_.track[map_.use()], minlength=len(map_.points))
-    tracks = np.flatnonzero(map_.known & (seen >= config.map.least_sightings))
+    tracks = np.flatnonzero(map_.known & (seen >= config.map.least_observations))
     colors = color_points(map_, tracks, images)
     keep = trim_points(map_.points[tracks])
     points = map_.points[tracks[keep]]
     # Before the first and after the last frame that shows the object, the nearest pose is used.
     place = np.clip(np.arange(len(report.model)) - first, 0, len(map_.posed) - 1)
-    checks, least = report.checks, config.checks.least_sightings
-    many = checks.sightings / (checks.sightings + 4.0 * least)
+    checks, least = report.checks, config.checks.least_observations
+    many = checks.observations / (checks.observations + 4.0 * least)
     sure = many * np.exp(-checks.uncertainty / config.checks.most_uncertain)
     return ObjectSfm(
         rotations=map_.rotations[place],
         transl=map_.transl[place],
-        valid=checks.sightings >= least,
+        valid=checks.observations >= least,
         confidence=np.where(checks.doubtful(), 0.0, sure),
         points=points,
         colors=colors[keep],

@@ -113,14 +113,14 @@ def _seen_colors(
     `images` are those of the frames of `views`; `surface` is samples [N, 3] and their normals.
     """
     samples, normals = surface
-    sightings: list[list[np.ndarray]] = [[] for _ in chosen]
+    observations: list[list[np.ndarray]] = [[] for _ in chosen]
     for t, image in enumerate(images):
         shows = seen_in(views, t, samples[chosen], normals[chosen], samples, config.tolerance)
         row, column, _, _ = views.pixels(t, samples[chosen[shows]])
         for i, color in zip(np.flatnonzero(shows), image[row, column], strict=True):
-            sightings[i].append(color)
+            observations[i].append(color)
     unknown = np.full(3, np.nan)
-    return np.array([np.median(shown, axis=0) if shown else unknown for shown in sightings]).reshape(-1, 3)
+    return np.array([np.median(shown, axis=0) if shown else unknown for shown in observations]).reshape(-1, 3)
 
 
 def _lent(points: np.ndarray, colors: np.ndarray, others: np.ndarray, theirs: np.ndarray) -> np.ndarray:

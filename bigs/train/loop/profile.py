@@ -15,7 +15,7 @@ from unittest import mock
 
 import torch
 
-from bigs.models.moments import Moments
+from bigs.models.posed_scene import PosedScene
 from bigs.models.scene import Scene
 from bigs.raster import rust
 from bigs.train.loop import step, terms
@@ -136,7 +136,10 @@ def profiled() -> Iterator[Profile]:
     """A profile of what runs inside; its `listen` must hear the run's events."""
     profile = Profile()
     functions: list[tuple[Any, str, str]] = [
-        *((Moments, name, _POSING) for name in ("posed", "posed_hand", "verts", "joints", "object_points")),
+        *(
+            (PosedScene, name, _POSING)
+            for name in ("posed", "posed_hand", "verts", "joints", "object_points")
+        ),
         (step, "rasterization", _ENGINE),
         (rust._raster, "rasterize_backward", _ENGINE_BACK),
         (torch.Tensor, "backward", _BACK),

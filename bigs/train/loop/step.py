@@ -12,7 +12,7 @@ from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_t
 from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand, CanonicalObject
-from bigs.models.moments import Moments
+from bigs.models.posed_scene import PosedScene
 from bigs.models.scene import Scene
 from bigs.raster import rasterization
 from bigs.raster.api import Means2d
@@ -79,7 +79,7 @@ class Step:
         return tuple(e for e in self.entities if e != "object")
 
     @cached_property
-    def clip(self) -> Moments:
+    def posed_clip(self) -> PosedScene:
         """All frames, for terms over time."""
         return self.scene.at(torch.arange(self.scene.n_frames))
 
@@ -139,7 +139,7 @@ class Step:
         """One subject rendered without the others (the paper's single-subject step)."""
         if entity not in self._alone:
             frames = self.frames_of(entity)
-            posed = self.clip.at(frames).posed({entity: self.canonical[entity]})
+            posed = self.posed_clip.at(frames).posed({entity: self.canonical[entity]})
             if self.selection.pull and entity == "object":
                 self._alone[entity] = self.render(posed, "full")
                 self._alone[entity].info["means2d"].retain_grad()
@@ -170,7 +170,7 @@ class Step:
     def together(self) -> RenderOutput:
         """All subjects in one pass; after the three colours, one label channel per entity if labels count."""
         canonical = {entity: self.canonical[entity] for entity in self.entities}
-        return self.render(self.clip.at(self.frames).posed(canonical, self.selection.labels))
+        return self.render(self.posed_clip.at(self.frames).posed(canonical, self.selection.labels))
 
     @cached_property
     def together_terms(self) -> TogetherTerms:
@@ -200,7 +200,7 @@ class Step:
 
     def silhouette(self, side: Side) -> Tensor:
         """How far the outline of a hand's few opaque Gaussians is from what its own mask allows."""
-        posed = self.clip.at(self.frames_of(side)).posed_hand(side, self.evidence.silhouettes[side])
+        posed = self.posed_clip.at(self.frames_of(side)).posed_hand(side, self.evidence.silhouettes[side])
         return self._against_own(side, None, self.render(posed).alphas).coverage
 
     def _against_own(self, entity: Entity, colors: Tensor | None, alphas: Tensor) -> AloneTerms:
@@ -211,14 +211,15 @@ class Step:
     @cached_property
     def joints(self) -> dict[Side, Tensor]:
         """Joints [T, 21, 3] of every hand in every frame of the clip."""
-        return {side: self.clip.joints(side) for side in self.scene.sides}
+        return {side: self.posed_clip.joints(side) for side in self.scene.sides}
 
     @cached_property
     def object_distances(self) -> dict[Side, Tensor]:
         """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
         scale = self.scene.object_poses.log_scale.exp()
         return {
-            side: scale * self.scene.object_distance(self.clip.in_object_frame(self.clip.verts(side)))
+            side: scale
+            * self.scene.object_distance(self.posed_clip.in_object_frame(self.posed_clip.verts(side)))
             for side in self.scene.sides
         }
 

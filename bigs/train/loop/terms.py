@@ -108,13 +108,13 @@ def ssim_together(step: Step) -> Tensor:
 
 
 def mask_together(step: Step) -> Tensor:
-    """The paper's mask regulariser (1 - m) I, also where sleeves are; `spill` leaves those out."""
+    """The paper's mask regulariser (1 - m) I, also where sleeves are; `alpha_outside` leaves those out."""
     return outside_mask(step.together.colors[..., :3], step.foreground)
 
 
-def spill(step: Step) -> Tensor:
+def alpha_outside(step: Step) -> Tensor:
     """Squared alpha outside all masks, per pixel of the masks, without what something unlabelled covers."""
-    return step.together_terms.spill
+    return step.together_terms.alpha_outside
 
 
 def mask_random_together(step: Step) -> Tensor:
@@ -184,7 +184,7 @@ def sds(step: Step) -> Tensor:
     if canonical is None:
         return torch.zeros(())
     denoiser, generator = step.evidence.denoiser, step.generator()
-    orbit = object_orbit(canonical.means.detach(), step.clip.object)
+    orbit = object_orbit(canonical.means.detach(), step.posed_clip.object)
     directions = torch.nn.functional.normalize(torch.randn(_SDS_VIEWS, 3, generator=generator), dim=-1)
     cameras = virtual_cameras(orbit, directions, denoiser.image_size)
     return sds_loss(
@@ -201,7 +201,7 @@ def smooth(step: Step) -> Tensor:
     """The paper's L_smt (Eq. 6): squared steps of fingers and wrist from frame to frame."""
 
     def one(side: Side) -> Tensor:
-        pose = step.clip.canonical_hand(side)
+        pose = step.posed_clip.canonical_hand(side)
         return pose_steps(pose.hand_pose, pose.wrist)
 
     return _mean(one(side) for side in step.scene.sides)
@@ -218,7 +218,7 @@ def object_acceleration(step: Step) -> Tensor:
         return torch.zeros(())
     reach = step.scene.object_surface.verts.abs().amax()
     corners = reach * torch.eye(3)
-    return acceleration(step.clip.object_points(corners))
+    return acceleration(step.posed_clip.object_points(corners))
 
 
 def orient_prior(step: Step) -> Tensor:
@@ -239,7 +239,7 @@ def depth_prior(step: Step) -> Tensor:
 
     def one(side: Side) -> Tensor:
         poses = step.scene.hand_poses[side]
-        away = step.clip.hand(side).wrist[:, 2].log() - poses.expected_log_depth
+        away = step.posed_clip.hand(side).wrist[:, 2].log() - poses.expected_log_depth
         return (poses.has_expected_depth * away.square()).mean()
 
     return _mean(one(side) for side in step.scene.sides)
@@ -270,7 +270,7 @@ def rigid(step: Step) -> Tensor:
 
     def one(side: Side) -> Tensor:
         touching = step.evidence.touching[side]
-        joints = step.clip.in_object_frame(step.joints[side])
+        joints = step.posed_clip.in_object_frame(step.joints[side])
         return velocity(joints, touching[1:] * touching[:-1])
 
     return _mean(one(side) for side in step.scene.sides)
@@ -281,7 +281,7 @@ def contact(step: Step) -> Tensor:
     if not step.has_object:
         return torch.zeros(())
     if step.evidence.contact == "center":
-        centers = step.clip.object.centers
+        centers = step.posed_clip.object.centers
         return _mean(
             center_contact(centers, joints[:, 0], step.evidence.touching[side])
             for side, joints in step.joints.items()
@@ -335,7 +335,7 @@ IMAGE_TERMS: dict[str, dict[str, Term]] = {
         ssim=ssim_together,
         perceptual=perceptual_together,
         mask=mask_together,
-        spill=spill,
+        alpha_outside=alpha_outside,
         mask_random=mask_random_together,
         labels=labels,
     ),

@@ -13,7 +13,7 @@ from bigs.train.loop.density import DensifyConfig
 from bigs.train.start.completion import CompletionConfig
 from bigs.train.start.initial import InitialConfig
 
-Step = Literal["single-subject", "interacting-subjects"]
+StepKind = Literal["single-subject", "interacting-subjects"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class OptimizeStage:
 
     name: str
     # The paper's two steps: every subject rendered alone, or all together.
-    step: Step
+    step: StepKind
     steps: int
     # Trainable groups (see `optim.GROUPS`) and their learning rates; a group that is not listed is frozen.
     lrs: dict[str, float]
@@ -53,7 +53,7 @@ class ScaleSearchStage:
     """The object's size by a one-dimensional search over contact."""
 
     name: str = "object-scale-search"
-    step: Step = "interacting-subjects"
+    step: StepKind = "interacting-subjects"
     # Relative sizes to try: `candidates` values evenly spaced in 1 - span ... 1 + span.
     span: float = 0.14
     candidates: int = 29
@@ -69,7 +69,7 @@ class GraspStage:
     """Grasps: from here on the object carries a hand while it holds on (see `train.grasps.find`)."""
 
     name: str = "grasps"
-    step: Step = "interacting-subjects"
+    step: StepKind = "interacting-subjects"
     # A frame outside grasps costs as much as a frame in a grasp with this squared error, in standard
     # deviations; a grasp costs as much as a few frames outside, so that five frames can form one.
     free: float = 3.0
@@ -102,7 +102,7 @@ class ObjectMotionStage:
     """
 
     name: str = "object-motion"
-    step: Step = "single-subject"
+    step: StepKind = "single-subject"
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
 
 
@@ -111,7 +111,7 @@ class SplitStage:
     """Evaluate the fields a last time and continue with free Gaussians (see `models.free_gaussians`)."""
 
     name: str = "split"
-    step: Step = "single-subject"
+    step: StepKind = "single-subject"
     # Each Gaussian of the object is split into parts x parts smaller ones.
     parts: int = 2
     # Whether the hands leave their field too.
@@ -148,7 +148,7 @@ class CompletionStage:
     """
 
     name: str = "object-completion"
-    step: Step = "single-subject"
+    step: StepKind = "single-subject"
     # Undo everything if the error of the clip's own frames grows by more than this share.
     most_worsening: float = 0.005
 
@@ -161,7 +161,7 @@ class GuidanceStage:
     """
 
     name: str = "object-prior"
-    step: Step = "single-subject"
+    step: StepKind = "single-subject"
     steps: int = 300
     # Virtual views per step, and their size in pixels.
     views: int = 4

@@ -16,6 +16,7 @@ from bigs.checks import InputError, check_choice, meant, nearest, shown
 from bigs.files import parse_yaml, read_yaml
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.ranges import check_ranges
+from bigs.train.plan.renamed import check_renamed
 
 # Messages show this much of a change.
 _SHOWN = 80
@@ -65,6 +66,7 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
         for depth, key in enumerate(keys):
             is_last = depth == len(keys) - 1
             may_be_new = bool(key) and is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
+            check_renamed(f"--set {change}", key)
             if not separator or not isinstance(node, dict) or not (key in node or may_be_new):
                 if not separator or not isinstance(node, dict):
                     raise InputError(f"--set {change}: expected path=value, found no setting {key!r}")
@@ -126,6 +128,7 @@ def _build(kind: Any, plain: Any, where: str) -> Any:
         for key in plain:
             if not isinstance(key, str):
                 raise InputError(f"{where}: expected names as keys, found {shown(key)}")
+            check_renamed(where, key)
         return {key: _build(arguments[1], value, f"{where}.{key}") for key, value in plain.items()}
     if kind is float and isinstance(plain, int) and not isinstance(plain, bool):
         try:
@@ -165,6 +168,7 @@ def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:
         raise InputError(f"{where}: expected a mapping, found {shown(plain)}")
     hints = typing.get_type_hints(kind)
     for key in plain:
+        check_renamed(where, key)
         check_choice(where, key, hints, "keys")
     required = [
         f.name

@@ -146,7 +146,7 @@ _JOINT = OptimizeStage(
     weights={
         "image": 4.0,
         "mse": 30.0,
-        "spill": 4.0,
+        "alpha_outside": 4.0,
         "labels": 0.5,
         "silhouette": 4.0,
         "scale": 100.0,
@@ -197,7 +197,7 @@ _DETAIL = replace(
     weights={
         **{name: weight for name, weight in _JOINT.weights.items() if name != "silhouette"},
         "mse": 300.0,
-        "spill": 25.0,
+        "alpha_outside": 25.0,
     },
     image_size=480,
     frames_per_step=8,

@@ -123,7 +123,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "max_features": _COUNT,
     },
     FollowConfig: {"levels": _COUNT, "half": Range(1, 100), "guides": _COUNT},
-    MapConfig: {"keep_error": _POSITIVE, "least_sightings": Range(2, 10**6)},
+    MapConfig: {"keep_error": _POSITIVE, "least_observations": Range(2, 10**6)},
     PatchConfig: {"max_side": Range(16, 1 << 16), "half": Range(1, 100), "neighbours": Range(3, 1000)},
     BundleConfig: {
         "pixel_sigma": _POSITIVE,

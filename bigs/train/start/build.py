@@ -23,7 +23,6 @@ from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.motion.tracker import TrackedMotion
-from bigs.train.start.carving import carve, convex_surface
 from bigs.train.start.completion import CompletionConfig, complete
 from bigs.train.start.initial import (
     InitialConfig,
@@ -34,6 +33,7 @@ from bigs.train.start.initial import (
     smooth_object,
 )
 from bigs.train.start.object_motion import pose_errors, with_motion
+from bigs.train.start.visual_hull import convex_surface, find_object_hull
 from bigs.types import Side
 
 
@@ -153,8 +153,8 @@ def _object_surfaces(
     completion: CompletionConfig | None,
 ) -> _ObjectSurfaces:
     try:
-        carving = carve(clip, unknown, start, initial)
-        grid = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
+        hull = find_object_hull(clip, unknown, start, initial)
+        grid = hull.closed(initial, hull.points, hull.normals, initial.surface_reach)
         closed = extract_mesh(grid)
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)
@@ -162,7 +162,7 @@ def _object_surfaces(
         why = f"object surface from masks: {reason}; using the points' convex hull instead"
         return _ObjectSurfaces(closed, None, grid, [], [why])
     support = Support(
-        seen_samples(carving.views, grid, initial.seen_frames, initial.seen_tolerance), carving.points
+        seen_samples(hull.views, grid, initial.seen_frames, initial.seen_tolerance), hull.points
     )
     verts, faces = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(closed[0][verts], faces).sum() / face_areas(*closed).sum()
@@ -171,7 +171,7 @@ def _object_surfaces(
         known = KnownPart(torch.as_tensor(verts), torch.as_tensor(faces), left_out)
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
-        symmetries = complete(carving, start, initial, completion).symmetries
+        symmetries = complete(hull, start, initial, completion).symmetries
         if not symmetries:
             grid = support.without_guesses(grid, initial.surface_solid)
     return _ObjectSurfaces(closed, known, grid, symmetries, [])

@@ -14,8 +14,8 @@ from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid
 from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
-from bigs.train.start.carving import Carving
 from bigs.train.start.initial import InitialConfig, ObjectStart
+from bigs.train.start.visual_hull import ObjectHull
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ _OUTSIDE = 0.67
 
 
 def complete(
-    carving: Carving,
+    hull: ObjectHull,
     start: ObjectStart,
     initial: InitialConfig,
     config: CompletionConfig,
@@ -71,11 +71,11 @@ def complete(
     The search is a matter of seconds.
 
     Args:
-        carving, start, initial, config: see those classes.
+        hull, start, initial, config: see those classes.
         earlier: symmetries for which the evidence was strong before; they count if there is none now.
     """
-    plain = carving.closed(initial, carving.points, carving.normals, initial.surface_reach)
-    points, normals, seen = seen_samples(carving.views, plain, initial.seen_frames, initial.seen_tolerance)
+    plain = hull.closed(initial, hull.points, hull.normals, initial.surface_reach)
+    points, normals, seen = seen_samples(hull.views, plain, initial.seen_frames, initial.seen_tolerance)
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
         return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")
@@ -84,26 +84,26 @@ def complete(
     measured = seen & (distance < config.measured)
     colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
     surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
-    is_empty = _empty_space(carving, surface, initial)
+    is_empty = _empty_space(hull, surface, initial)
     symmetries = find_symmetries(surface, is_empty, config.symmetry) or list(earlier)
     if not symmetries:
         return replace(nothing, why_not="no strong evidence for any")
-    known = SeenSurface(carving.points, carving.normals, colors[tree.query(carving.points)[1]])
+    known = SeenSurface(hull.points, hull.normals, colors[tree.query(hull.points)[1]])
     whole = completed(known, symmetries, is_empty, config.gap)
     # The points now surround the object, so nothing lies beyond their convex hull.
-    grid = carving.closed(initial, whole.points, whole.normals, 0.0)
+    grid = hull.closed(initial, whole.points, whole.normals, 0.0)
     added = slice(len(known.points), None)
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 
 
-def _empty_space(carving: Carving, surface: SeenSurface, config: InitialConfig) -> IsEmpty:
+def _empty_space(hull: ObjectHull, surface: SeenSurface, config: InitialConfig) -> IsEmpty:
     """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
-    grid = carving.hull
+    grid = hull.grid
     corners = grid.points()
     outside = grid.values.ravel()
     near = np.flatnonzero(outside < config.seen_tolerance)
     empty = np.ones(len(corners))
-    before = times_empty(carving.views, corners[near], surface.points, config.seen_tolerance)
+    before = times_empty(hull.views, corners[near], surface.points, config.seen_tolerance)
     empty[near] = (outside[near] > _OUTSIDE * config.seen_tolerance) | (before >= config.seen_frames)
     volume = empty.reshape(grid.values.shape)
 

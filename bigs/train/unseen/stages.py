@@ -11,8 +11,8 @@ from bigs.models.scene import Scene
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageState
 from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig
-from bigs.train.unseen.completed_scene import CompletedScene, complete_scene
-from bigs.train.unseen.guided_scene import guide_scene
+from bigs.train.unseen.prior_stage import guide_scene
+from bigs.train.unseen.symmetry_stage import StageOutcome, complete_scene
 
 # Image size at which errors of the seen part are measured.
 _OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
@@ -24,7 +24,7 @@ def run_completion(
     sources: EvidenceSource,
     config: RunConfig,
     earlier: Sequence[Symmetry],
-) -> CompletedScene:
+) -> StageOutcome:
     """Complete the object by its symmetries; see `complete_scene`."""
     return complete_scene(
         scene,
@@ -49,7 +49,7 @@ def run_guidance(
     resume: dict[str, Any] | None,
     keep: Callable[[int, StageState | None], None],
     listen: Callable[[dict[str, Any]], None],
-) -> CompletedScene:
+) -> StageOutcome:
     """Let a diffusion prior complete the object; see `guide_scene`. Its state is kept as of any stage."""
 
     def after_step(state: StageState, loss: float) -> None:

@@ -14,7 +14,7 @@ def test_costs_are_told_by_size(call: Callable[..., Answer], tmp_path: Path) -> 
     assert call("bench", "adjustment", *plan, "--out", str(tmp_path)).code == 0
     runs = json.loads((tmp_path / "adjustment.json").read_text())["runs"]
     # Ten frames of eight are all of them.
-    sizes = [(run["frames"], run["seen"], run["sightings"]) for run in runs]
+    sizes = [(run["frames"], run["seen"], run["observations"]) for run in runs]
     assert sizes == [(8, 8, 480), (12, 12, 720), (12, 10, 600)]
     assert all(run["step_degrees"] < 0.3 for run in runs)
     assert "| 12 | 60 | 10 | 600 |" in (tmp_path / "adjustment.md").read_text()

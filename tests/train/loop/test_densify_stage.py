@@ -34,7 +34,7 @@ from bigs.train.plan.config_file import from_plain, to_plain, with_changes
 from bigs.train.plan.presets import PRESETS
 from bigs.train.start.background import unknown_occluders
 from bigs.train.switches import without
-from bigs.train.unseen.seen import image_error
+from bigs.train.unseen.visibility import image_error
 from bigs.types import Side
 
 # Whoever is pulled at all: every other step from the second to the eighth.

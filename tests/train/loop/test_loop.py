@@ -14,7 +14,7 @@ from toy_stages import ALONE, TOGETHER, held_cube, random_evidence, values
 
 from bigs.checks import InputError
 from bigs.hand import HandModel
-from bigs.losses.mask import label_difference, outside_mask, spilled
+from bigs.losses.mask import alpha_outside_masks, label_difference, outside_mask
 from bigs.losses.photometric import masked_l1, masked_mse
 from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
@@ -146,7 +146,9 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
     whole = {
         "image": masked_l1(rendered[..., :3], images, foreground),
         "mse": masked_mse(rendered[..., :3], images, foreground),
-        "spill": spilled(step.together.alphas.flatten(0, 2), 1.0 - foreground.flatten(), foreground),
+        "alpha_outside": alpha_outside_masks(
+            step.together.alphas.flatten(0, 2), 1.0 - foreground.flatten(), foreground
+        ),
         "labels": label_difference(rendered[..., 3:], labels),
     }
     for name, value in whole.items():
@@ -154,7 +156,7 @@ def test_pixels_that_count_say_what_whole_images_say(scene: Scene, evidence: Evi
         assert value > 0.0, name
 
 
-@pytest.mark.parametrize("name", ["image", "mse", "spill", "labels"])
+@pytest.mark.parametrize("name", ["image", "mse", "alpha_outside", "labels"])
 def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, name: str) -> None:
     """No term of single pixels pulls at what is rendered there."""
     targets = evidence.targets
@@ -169,7 +171,7 @@ def test_what_a_sleeve_covers_says_nothing(scene: Scene, evidence: Evidence, nam
         return IMAGE_TERMS["interacting-subjects"][name](step)
 
     assert term(covered) == 0.0
-    if name in ("spill", "labels"):
+    if name in ("alpha_outside", "labels"):
         assert term(bare) > 0.0
 
 

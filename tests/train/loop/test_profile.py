@@ -9,7 +9,7 @@ import torch
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
-from bigs.models.moments import Moments
+from bigs.models.posed_scene import PosedScene
 from bigs.models.scene import Scene
 from bigs.train.fit import fit
 from bigs.train.loop import step, terms
@@ -95,11 +95,11 @@ def test_a_stage_lasts_until_the_next(clock: Clock) -> None:
 
 def test_a_run_in_a_profile(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
     config = short(PRESETS["smoke"], "hands-coarse", "joint")
-    before = (Moments.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
+    before = (PosedScene.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
     plain, _ = fit(tiny, both_hands, config)
     with profiled() as profile:
         timed, _ = fit(tiny, both_hands, config, listen=profile.listen)
-    after = (Moments.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
+    after = (PosedScene.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)
     assert after == before
 
     for (name, one), (_, other) in zip(plain.state_dict().items(), timed.state_dict().items(), strict=True):

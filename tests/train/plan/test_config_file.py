@@ -204,3 +204,26 @@ def test_changes_that_cannot_be(change: str, smoke: RunConfig) -> None:
     with pytest.raises(InputError, match="--set") as caught:
         with_changes(smoke, [change])
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("stages.joint.weights.spill=1", "expected alpha_outside, as it is called now, found spill"),
+        (
+            "stages.object-motion.tracker.map.least_sightings=4",
+            "expected least_observations, as it is called now, found least_sightings",
+        ),
+    ],
+)
+def test_an_old_name_is_refused_with_the_new_one(change: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        with_changes(PRESETS["fast"], [change])
+    plain = to_plain(PRESETS["fast"])
+    path, value = change.split("=")
+    node = plain
+    for key in path.split(".")[:-1]:
+        node = node[key]
+    node[path.split(".")[-1]] = int(value)
+    with pytest.raises(InputError, match=words):
+        from_plain(plain, "config.yaml")

@@ -19,9 +19,9 @@ from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
 from bigs.train.plan.presets import SMOKE
 from bigs.train.start.build import build_scene
-from bigs.train.start.carving import Carving, carve
 from bigs.train.start.completion import Completion, CompletionConfig, complete
 from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
+from bigs.train.start.visual_hull import ObjectHull, find_object_hull
 from bigs.types import HandObjectTrajectory, Side
 
 INITIAL = InitialConfig(surface_resolution=56)
@@ -35,10 +35,10 @@ def bottle(
 
 
 @pytest.fixture(scope="module")
-def one_side(bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, Carving, ObjectStart]:
+def one_side(bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, ObjectHull, ObjectStart]:
     clip = limited_view(*bottle, range(12))
     start = smooth_object(object_in_camera(clip, INITIAL), 2.0)
-    return clip, carve(clip, nothing_hides(clip), start, INITIAL), start
+    return clip, find_object_hull(clip, nothing_hides(clip), start, INITIAL), start
 
 
 def nothing_hides(clip: Clip) -> np.ndarray:
@@ -52,23 +52,23 @@ def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
 
 @pytest.mark.slow
 def test_the_unseen_side_comes_nearer_to_the_truth(
-    one_side: tuple[Clip, Carving, ObjectStart], bottle: tuple[Clip, HandObjectTrajectory]
+    one_side: tuple[Clip, ObjectHull, ObjectStart], bottle: tuple[Clip, HandObjectTrajectory]
 ) -> None:
-    _, carving, start = one_side
-    found = complete(carving, start, INITIAL, CompletionConfig())
+    _, hull, start = one_side
+    found = complete(hull, start, INITIAL, CompletionConfig())
     assert found.seen < 0.7
     assert found.symmetries and len(found.points) == len(found.colors) > 100
-    before = score(carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach), bottle[1])
+    before = score(hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach), bottle[1])
     after = score(found.surface, bottle[1])
     assert after.chamfer.squared < 0.8 * before.chamfer.squared
     assert after.f5 > before.f5 and after.f10 >= before.f10
 
 
 def test_a_symmetry_found_at_the_start_leaves_what_hands_meet(
-    one_side: tuple[Clip, Carving, ObjectStart], both_hands: dict[Side, HandModel]
+    one_side: tuple[Clip, ObjectHull, ObjectStart], both_hands: dict[Side, HandModel]
 ) -> None:
-    clip, carving, start = one_side
-    found = complete(carving, start, INITIAL, CompletionConfig())
+    clip, hull, start = one_side
+    found = complete(hull, start, INITIAL, CompletionConfig())
     plan = (clip, nothing_hides(clip), both_hands, INITIAL, SMOKE.hand, SMOKE.object, False)
     built, plain = build_scene(*plan, CompletionConfig()), build_scene(*plan)
     assert len(built.symmetries) == len(found.symmetries) > 0 and not plain.symmetries
@@ -78,40 +78,40 @@ def test_a_symmetry_found_at_the_start_leaves_what_hands_meet(
 
 
 def test_symmetries_found_earlier_count_if_there_are_none_now(
-    one_side: tuple[Clip, Carving, ObjectStart],
+    one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
-    _, carving, start = one_side
+    _, hull, start = one_side
     base = CompletionConfig()
-    found = complete(carving, start, INITIAL, base)
+    found = complete(hull, start, INITIAL, base)
     strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
-    again = complete(carving, start, INITIAL, strict, found.symmetries)
+    again = complete(hull, start, INITIAL, strict, found.symmetries)
     assert again.symmetries == found.symmetries
     np.testing.assert_array_equal(again.surface.values, found.surface.values)
 
 
 def test_less_counts_as_seen_the_more_frames_must_show_it(
-    one_side: tuple[Clip, Carving, ObjectStart],
+    one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
-    _, carving, _ = one_side
-    surface = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
-    shares = [seen_samples(carving.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
+    _, hull, _ = one_side
+    surface = hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach)
+    shares = [seen_samples(hull.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
     assert shares[0] > shares[1] > shares[2] > 0.0
-    assert seen_samples(carving.views, surface, 3, 0.0).seen.mean() < shares[1]
+    assert seen_samples(hull.views, surface, 3, 0.0).seen.mean() < shares[1]
 
 
-def test_weak_evidence_changes_nothing(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
-    _, carving, start = one_side
+def test_weak_evidence_changes_nothing(one_side: tuple[Clip, ObjectHull, ObjectStart]) -> None:
+    _, hull, start = one_side
     base = CompletionConfig()
     strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
-    found = complete(carving, start, INITIAL, strict)
-    plain = carving.closed(INITIAL, carving.points, carving.normals, INITIAL.surface_reach)
+    found = complete(hull, start, INITIAL, strict)
+    plain = hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach)
     assert "no strong evidence" in str(found)
     np.testing.assert_array_equal(found.surface.values, plain.values)
 
 
-def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, Carving, ObjectStart]) -> None:
-    _, carving, start = one_side
-    found = complete(carving, start, INITIAL, CompletionConfig(enough=0.05))
+def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, ObjectHull, ObjectStart]) -> None:
+    _, hull, start = one_side
+    found = complete(hull, start, INITIAL, CompletionConfig(enough=0.05))
     assert not found.symmetries and "of the object's surface was seen" in str(found)
 
 

@@ -23,8 +23,8 @@ from bigs.train.plan.presets import SMOKE
 from bigs.train.resolve import resolve
 from bigs.train.start.completion import CompletionConfig
 from bigs.train.start.initial import InitialConfig
-from bigs.train.unseen.completed_scene import blended_colors
-from bigs.train.unseen.seen import image_error, weights_in_pictures
+from bigs.train.unseen.symmetry_stage import blended_colors
+from bigs.train.unseen.visibility import image_error, weights_in_pictures
 from bigs.types import HandObjectTrajectory, Side
 
 PLAN = replace(

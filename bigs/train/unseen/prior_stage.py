@@ -18,8 +18,7 @@ from bigs.raster.settings import RasterSettings
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.virtual_views import object_orbit, render_object
 from bigs.train.plan.config import GuidanceStage
-from bigs.train.unseen.completed_scene import CompletedScene
-from bigs.train.unseen.guided import (
+from bigs.train.unseen.prior_descent import (
     AfterStep,
     Coverage,
     Hold,
@@ -27,7 +26,8 @@ from bigs.train.unseen.guided import (
     follow,
     guide_object,
 )
-from bigs.train.unseen.seen import (
+from bigs.train.unseen.symmetry_stage import StageOutcome
+from bigs.train.unseen.visibility import (
     SHOWS,
     frames_seen,
     guard_frames,
@@ -63,7 +63,7 @@ def guide_scene(
     seed: int,
     resume: Mapping[str, Any] | None = None,
     after_step: AfterStep = lambda state, loss: None,
-) -> CompletedScene:
+) -> StageOutcome:
     """Let a prior complete the scene's object, in place; its surface follows its Gaussians.
 
     Args:
@@ -86,7 +86,7 @@ def guide_scene(
     coverage, orbit = scene_coverage(scene, evidence)
     facts = {"object seen before the prior": f"{coverage.share:.0%} of its Gaussians"}
     if coverage.share >= stage.enough or not (coverage.by_direction < stage.well_seen).any():
-        return CompletedScene(f"{coverage.share:.0%} of the object was seen", facts)
+        return StageOutcome(f"{coverage.share:.0%} of the object was seen", facts)
     with torch.no_grad():
         canonical = detail()
     strange = strangeness(canonical, coverage, orbit, denoiser, stage, evidence.settings)
@@ -95,11 +95,11 @@ def guide_scene(
             f"left out, since the prior does not know this object: on its seen sides it is {strange:.1f} "
             f"times as wrong as on its own meshes ({stage.unlike} is allowed)"
         )
-        return CompletedScene(reason, facts)
+        return StageOutcome(reason, facts)
     # What shows in any frame stays, even if too few frames show it to be sure.
     held = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
     if held.seen.all():
-        return CompletedScene("all of the object's Gaussians show", facts)
+        return StageOutcome("all of the object's Gaussians show", facts)
     found = {name: value.clone() for name, value in detail.state_dict().items()}
     some, every = guard_frames(scene.n_frames), torch.arange(scene.n_frames)
 
@@ -122,7 +122,7 @@ def guide_scene(
     )
     if done.rolled_back:
         reason = f"undone, since the clip's frames would look worse ({done.worst:+.1%} error or size)"
-        return CompletedScene(reason, facts)
+        return StageOutcome(reason, facts)
     _put_back(scene, evidence, detail, found, held.seen)
     with torch.no_grad():
         scene.surface_verts.copy_(follow(scene.surface_verts, canonical.means, done.moved))
@@ -132,7 +132,7 @@ def guide_scene(
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
         f"error of the seen part {done.worst:+.1%} at most"
     )
-    return CompletedScene(None, facts)
+    return StageOutcome(None, facts)
 
 
 def _put_back(

@@ -24,7 +24,7 @@ from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.plan.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import PRESETS, SMOKE
 from bigs.train.resolve import resolve
-from bigs.train.unseen.seen import SHOWS, image_error, overflow, weights_in_pictures
+from bigs.train.unseen.visibility import SHOWS, image_error, overflow, weights_in_pictures
 from bigs.types import Side
 
 STAGE = GuidanceStage(steps=3, views=2, image_size=32)

@@ -57,10 +57,10 @@ def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
 
 
 @dataclass(frozen=True)
-class Carving:
+class ObjectHull:
     """The visual hull from the clip's frames, and the object's points in it."""
 
-    hull: DistanceGrid  # to the visual hull; exact up to `InitialConfig.surface_reach`
+    grid: DistanceGrid  # distance to the visual hull; exact up to `InitialConfig.surface_reach`
     shown: np.ndarray  # [X * Y * Z] share of the frames that show object there; 0 outside the hull's reach
     points: np.ndarray  # [N, 3] metres, inside the silhouettes
     normals: np.ndarray  # [N, 3] unit, outward
@@ -74,16 +74,18 @@ class Carving:
         Beyond that hull only what nearly always shows as object stays, up to twice `allowance` metres: the
         far side of an object that was never turned does, the space that a hand always covers does not.
         """
-        distance = self.hull.values.ravel().copy()
+        distance = self.grid.values.ravel().copy()
         doubtful = np.flatnonzero(distance < config.surface_reach)
-        beyond = convex_distance(self.hull.points()[doubtful], points) - config.surface_margin
+        beyond = convex_distance(self.grid.points()[doubtful], points) - config.surface_margin
         relief = allowance * ((self.shown[doubtful] - config.surface_shown) / 0.1).clip(0.0)
         distance[doubtful] = np.maximum(distance[doubtful], beyond - relief)
-        carved = DistanceGrid(distance.reshape(self.hull.values.shape), self.hull.origin, self.hull.spacing)
+        carved = DistanceGrid(distance.reshape(self.grid.values.shape), self.grid.origin, self.grid.spacing)
         return blend_with_points(carved, points, normals, config.surface_reach)
 
 
-def carve(clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialConfig) -> Carving:
+def find_object_hull(
+    clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialConfig
+) -> ObjectHull:
     """The visual hull of the masks, and the points inside it.
 
     `unknown` [T, H, W] (bool) marks unlabelled occluders.
@@ -116,7 +118,7 @@ def carve(clip: Clip, unknown: np.ndarray, start: ObjectStart, config: InitialCo
     shown = np.zeros(len(corners))
     near = distance < config.surface_reach
     shown[near] = hull.share_seen(corners[near], shown_here)
-    return Carving(
+    return ObjectHull(
         DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing),
         shown,
         points,

@@ -13,7 +13,7 @@ from bigs.geometry.mesh import sample_surface
 from bigs.metrics.shape import ShapeScore, shape_score
 from bigs.raster import RasterSettings
 from bigs.train.plan.config import GuidanceStage
-from bigs.train.unseen.guided import Guided, coverage_of, follow, guide_object
+from bigs.train.unseen.prior_descent import Guided, coverage_of, follow, guide_object
 
 STAGE = GuidanceStage(image_size=48, steps=200, lr_shift=1e-3)
 

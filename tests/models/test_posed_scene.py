@@ -22,22 +22,22 @@ def scene() -> Scene:
     of_frame = torch.zeros(FRAMES, dtype=torch.long)
     of_frame[-1] = -1
     with torch.no_grad():
-        moments = scene.at(ALL)
-        scene.grasps["left"].set(of_frame, 0.1, moments.hand("left"), moments.object)
+        posed = scene.at(ALL)
+        scene.grasps["left"].set(of_frame, 0.1, posed.hand("left"), posed.object)
     return scene
 
 
-def looked_at(scene: Scene, moments) -> torch.Tensor:
-    """Something that depends on all that can be asked of two frames' moments."""
+def looked_at(scene: Scene, posed) -> torch.Tensor:
+    """Something that depends on all that can be asked of two frames' posed."""
     canonical = scene.canonical(scene.entities)
     total = torch.zeros(())
     for entity in scene.entities:
-        part = moments.posed({entity: canonical[entity]})
+        part = posed.posed({entity: canonical[entity]})
         total = total + part.means.sin().sum() + part.quats.sin().sum() + part.colors.sin().sum()
         if entity != "object":
-            total = total + moments.verts(entity).cos().sum() + moments.joints(entity).cos().sum()
-            total = total + moments.in_object_frame(moments.joints(entity)).sin().sum()
-    return total + moments.object_points(torch.eye(3)).sin().sum()
+            total = total + posed.verts(entity).cos().sum() + posed.joints(entity).cos().sum()
+            total = total + posed.in_object_frame(posed.joints(entity)).sin().sum()
+    return total + posed.object_points(torch.eye(3)).sin().sum()
 
 
 def test_frames_of_a_whole_clip_are_those_frames(scene: Scene) -> None:
@@ -54,13 +54,13 @@ def test_frames_of_a_whole_clip_are_those_frames(scene: Scene) -> None:
 
 
 def test_joints_are_the_models_joints(scene: Scene) -> None:
-    moments = scene.at(ALL)
+    posed = scene.at(ALL)
     for side in scene.sides:
-        pose, model = moments.canonical_hand(side), scene.hand_model(side)
+        pose, model = posed.canonical_hand(side), scene.hand_model(side)
         out = model(scene.hand_betas(side), pose.hand_pose, pose.global_orient, pose.wrist)
         mirror = torch.tensor([-1.0 if side == "left" else 1.0, 1.0, 1.0])
-        torch.testing.assert_close(moments.joints(side), mirror * out.joints)
-        torch.testing.assert_close(moments.verts(side), mirror * out.vertices)
+        torch.testing.assert_close(posed.joints(side), mirror * out.joints)
+        torch.testing.assert_close(posed.verts(side), mirror * out.vertices)
 
 
 def test_nothing_is_worked_out_twice(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,8 +68,8 @@ def test_nothing_is_worked_out_twice(scene: Scene, monkeypatch: pytest.MonkeyPat
     for owner, name in ((HandPoses, "forward"), (ObjectPoses, "forward"), (HandModel, "skeleton")):
         monkeypatch.setattr(owner, name, counting(calls, owner.__name__, getattr(owner, name)))
     clip = scene.at(ALL)
-    for moments in (clip.at(SOME), clip.at(ALL[:1]), clip):
-        looked_at(scene, moments)
+    for posed in (clip.at(SOME), clip.at(ALL[:1]), clip):
+        looked_at(scene, posed)
     assert calls == {"HandPoses": 2, "ObjectPoses": 1, "HandModel": 2}
 
 

@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from bigs.models.scene import Scene
 
 
-class Moments:
+class PosedScene:
     """A scene at some frames, differentiable; valid until a parameter changes."""
 
-    def __init__(self, scene: Scene, frames: Tensor, of: Moments | None = None) -> None:
+    def __init__(self, scene: Scene, frames: Tensor, of: PosedScene | None = None) -> None:
         """
         Args:
             scene: whose poses.
             frames: [B] indices.
-            of: the moments of the whole clip, from which these are taken.
+            of: the scene at all frames, from which these are taken.
         """
         self._scene, self.frames, self._of = scene, frames, of
         self._hands: dict[Side, HandFrames] = {}
         self._skeletons: dict[Side, Skeleton] = {}
 
-    def at(self, frames: Tensor) -> Moments:
+    def at(self, frames: Tensor) -> PosedScene:
         """Some frames [B] of these, which have to be the whole clip's; what both need is shared."""
-        return Moments(self._scene, frames, self)
+        return PosedScene(self._scene, frames, self)
 
     @cached_property
     def object(self) -> ObjectFrames:

@@ -21,10 +21,10 @@ from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
 from bigs.train.plan.config import CompletionStage
-from bigs.train.start.carving import carve
 from bigs.train.start.completion import Completion, CompletionConfig, complete
 from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera
-from bigs.train.unseen.seen import (
+from bigs.train.start.visual_hull import find_object_hull
+from bigs.train.unseen.visibility import (
     SHOWS,
     frames_seen,
     guard_frames,
@@ -43,7 +43,7 @@ _COLORS_FROM = 8
 _BLENDED = 24
 
 
-class CompletedScene(NamedTuple):
+class StageOutcome(NamedTuple):
     """Facts to report."""
 
     skipped: str | None  # why nothing was changed
@@ -60,7 +60,7 @@ def complete_scene(
     completion: CompletionConfig,
     obj: ObjectSplatsConfig,
     earlier: Sequence[Symmetry] = (),
-) -> CompletedScene:
+) -> StageOutcome:
     """Complete the object by its symmetries where the clip never showed it; in place.
 
     The mesh is made again. Gaussians that show in any frame are kept, the others are replaced. If the clip's
@@ -77,13 +77,13 @@ def complete_scene(
     canonical = scene.object_splats()
     start = _at_final_poses(scene, clip, evidence, initial)
     try:
-        carving = carve(clip, unknown, start, initial)
-        found = complete(carving, start, initial, completion, earlier)
+        hull = find_object_hull(clip, unknown, start, initial)
+        found = complete(hull, start, initial, completion, earlier)
     except (ValueError, scipy.spatial.QhullError) as reason:
-        return CompletedScene(f"masks and points give no surface: {reason}", {})
+        return StageOutcome(f"masks and points give no surface: {reason}", {})
     facts = {"object seen": f"{found.seen:.0%} of its surface"}
     if not found.symmetries:
-        return CompletedScene(str(found), facts)
+        return StageOutcome(str(found), facts)
     frames = guard_frames(scene.n_frames)
     before = image_error(scene, evidence, scene.entities, frames)
     splats, surface = scene.object_splats, scene.object_surface
@@ -105,9 +105,9 @@ def complete_scene(
         scene.object_splats = splats
         scene.replace_surface(surface)
         reason = f"undone, since the clip's frames would look worse ({change:+.1%} error)"
-        return CompletedScene(reason, facts)
+        return StageOutcome(reason, facts)
     facts["object completed"] = f"{found}; error of the clip's frames {change:+.1%}"
-    return CompletedScene(None, facts)
+    return StageOutcome(None, facts)
 
 
 def _at_final_poses(scene: Scene, clip: Clip, evidence: Evidence, initial: InitialConfig) -> ObjectStart:
