@@ -289,7 +289,7 @@ def _detection_frames(file: Path, stored: Mapping[str, Any], count: int, frames:
 def _one_each(
     at: np.ndarray, mine: np.ndarray, score: np.ndarray, transl: np.ndarray, frames: int
 ) -> np.ndarray:
-    """For each frame one side's detection [T], -1 for none: the surest, then the nearest to the last."""
+    """One side's detection per frame [T], -1 for none: by score, then by distance to the previous one."""
     chosen = np.full(frames, -1)
     last: np.ndarray | None = None
     for t in range(frames):

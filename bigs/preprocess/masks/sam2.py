@@ -92,7 +92,7 @@ def segment_clip(
         listen: told how far it is.
 
     Returns:
-        T label images [H, W] uint8; where several things claim a pixel, the surest one has it.
+        T label images [H, W] uint8; a pixel that several things claim goes to the highest score.
     """
     scores: dict[Entity, list[Tensor]] = {}
     # Things clicked in the same frames share the encoding of each picture.
