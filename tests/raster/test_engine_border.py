@@ -93,7 +93,7 @@ def test_arrays_of_another_kind_are_told_by_name_and_dtype() -> None:
         forward((*inputs[:8], mask))
     with pytest.raises(TypeError, match="quats: expected an array of float32, found float64"):
         forward((inputs[0], inputs[1].astype(np.float64), *inputs[2:]))
-    with pytest.raises(TypeError, match="opacities: expected an array of float32, found .*list"):
+    with pytest.raises(TypeError, match=r"opacities: expected an array of float32, found .*list"):
         forward((*inputs[:3], [0.5] * 6, *inputs[4:]))
 
 

@@ -16,7 +16,12 @@ pub(crate) fn slice<'py, T: Element>(
 ) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
     let array = array.cast::<PyArrayDyn<T>>().map_err(|_| {
         let found = array.cast::<PyUntypedArray>().map_or_else(
-            |_| format!("{}", array.get_type()),
+            |_| {
+                array
+                    .get_type()
+                    .name()
+                    .map_or_else(|_| "another type".into(), |name| name.to_string())
+            },
             |array| array.dtype().to_string(),
         );
         let expected = dtype::<T>(array.py());
