@@ -11,8 +11,8 @@ import scipy.sparse
 from bigs.archives import read_npz
 from bigs.checks import InputError, check_choice, check_finite, check_shape, found_at
 from bigs.files import open_regular
+from bigs.hand.builtin import builtin_hand
 from bigs.hand.model import MANO_PARENTS, HandModel
-from bigs.hand.procedural import procedural_hand
 from bigs.types import SIDES, Side
 from bigs.unpickle import CHUMPY, restricted_load
 
@@ -44,13 +44,13 @@ def load_hand_models(path: str | Path | None) -> dict[Side, HandModel]:
 
     Args:
         path: a folder holding MANO_RIGHT and, optionally, MANO_LEFT as .npz or .pkl; a right-hand file; or
-            None for the procedural hand. Without a left file the left hand is the mirrored right hand.
+            None for the built-in hand. Without a left file the left hand is the mirrored right hand.
 
     Raises:
         InputError: a file is missing or is not a valid hand model.
     """
     if path is None:
-        right = procedural_hand("right")
+        right = builtin_hand("right")
         return {"right": right, "left": right.mirrored()}
     right = load_hand_model(path, "right")
     left_file = find_model_file(Path(path), "left") if Path(path).is_dir() else None

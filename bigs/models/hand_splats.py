@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder, SkinningDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.fused.posing import skin
+from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.hand import HandModel
@@ -73,10 +74,9 @@ class HandSplats(nn.Module):
         normals = vertex_normals(points, faces)
         spacing = point_spacing(points)
         sigma = config.scale_per_spacing * spacing
-        as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
         # A Gaussian on the surface reaches past the silhouette, so its centre is moved inwards by as much.
         inset = config.flatness * sigma[:, None] * normals
-        self.register_buffer("base_points", as_tensor(points - inset), persistent=False)
+        self.register_buffer("base_points", float32(points - inset), persistent=False)
         self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)
         if model.has_posedirs:
             self.register_buffer("posedirs", carry(model.posedirs), persistent=False)
@@ -84,10 +84,10 @@ class HandSplats(nn.Module):
             "base_weights", neighbour_weights(points, model.v_template, model.lbs_weights), persistent=False
         )
         self.register_buffer(
-            "base_quats", matrix_to_quat(as_tensor(frames_from_normals(normals))), persistent=False
+            "base_quats", matrix_to_quat(float32(frames_from_normals(normals))), persistent=False
         )
         base_scales = sigma[:, None] * np.array([1.0, 1.0, config.flatness])
-        self.register_buffer("base_log_scales", as_tensor(np.log(base_scales)), persistent=False)
+        self.register_buffer("base_log_scales", float32(np.log(base_scales)), persistent=False)
 
         bounds = torch.stack([self.base_points.amin(0), self.base_points.amax(0)])
         margin = 0.02 * (bounds[1] - bounds[0])

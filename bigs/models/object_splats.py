@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
+from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import frames_from_normals, point_spacing
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.models.canonical import CanonicalObject
@@ -56,19 +57,18 @@ class ObjectSplats(nn.Module):
         """Starts: points [N, 3] (metres), unit normals [N, 3] and colours [N, 3] in [0, 1]."""
         super().__init__()
         self.config = config
-        as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
         sigma = config.scale_per_spacing * point_spacing(points)
         flatness = 1.0 if config.isotropic else config.flatness
         inset = flatness * sigma[:, None] * normals
         # Buffers, not constants: densification changes their length, so a checkpoint must carry them.
-        self.register_buffer("base_points", as_tensor(points - inset))
-        self.register_buffer("normals", as_tensor(normals))
-        self.register_buffer("base_quats", matrix_to_quat(as_tensor(frames_from_normals(normals))))
+        self.register_buffer("base_points", float32(points - inset))
+        self.register_buffer("normals", float32(normals))
+        self.register_buffer("base_quats", matrix_to_quat(float32(frames_from_normals(normals))))
         scales = sigma[:, None] * np.array([1.0, 1.0, flatness])
-        self.register_buffer("base_log_scales", as_tensor(np.log(scales)))
-        self.register_buffer("color_logits", torch.logit(as_tensor(colors).clamp(0.02, 0.98)))
+        self.register_buffer("base_log_scales", float32(np.log(scales)))
+        self.register_buffer("color_logits", torch.logit(float32(colors).clamp(0.02, 0.98)))
 
-        self.register_buffer("weights", as_tensor(region_weights(points, normals, N_PARTS)))
+        self.register_buffer("weights", float32(region_weights(points, normals, N_PARTS)))
         bounds = torch.stack([self.base_points.amin(0), self.base_points.amax(0)])
         margin = 0.05 * (bounds[1] - bounds[0]) + config.max_offset
         self.triplane = Triplane(config.triplane, torch.stack([bounds[0] - margin, bounds[1] + margin]))

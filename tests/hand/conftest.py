@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bigs.hand import HandModel, procedural_hand
+from bigs.hand import HandModel, builtin_hand
 
 
 def model_fields(hand: HandModel, rng: np.random.Generator | None = None) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def model_fields(hand: HandModel, rng: np.random.Generator | None = None) -> dic
 
 @pytest.fixture(scope="session")
 def right() -> HandModel:
-    return procedural_hand("right").double()
+    return builtin_hand("right").double()
 
 
 @pytest.fixture

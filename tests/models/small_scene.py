@@ -14,7 +14,7 @@ from bigs.fields.triplane import TriplaneConfig
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.rotations import axis_angle_to_matrix, quat_to_matrix
 from bigs.geometry.surface import DistanceGrid, empty_grid
-from bigs.hand import HandModel, procedural_hand
+from bigs.hand import HandModel, builtin_hand
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.lighting import Lighting
 from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
@@ -33,7 +33,7 @@ OBJECT_RADIUS = 0.04
 @cache
 def hand_model(rich: bool = False) -> HandModel:
     """The built-in right hand; `rich` adds pose correctives and a mean pose, lest zeros be tested."""
-    model = procedural_hand("right")
+    model = builtin_hand("right")
     if not rich:
         return model
     generator = torch.Generator().manual_seed(7)

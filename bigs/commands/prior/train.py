@@ -22,6 +22,7 @@ from bigs.commands.prior.fit import read_state, state_path
 from bigs.data.fields import LARGEST
 from bigs.data.mesh_files import MESH_SUFFIXES, load_mesh_file
 from bigs.files import read_bytes
+from bigs.geometry.arrays import float32
 from bigs.geometry.coverage import sphere_directions
 from bigs.geometry.mesh import frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
@@ -171,17 +172,16 @@ def cover(shape: Shape) -> CanonicalObject:
     points, normals = sample_surface(shape.verts, shape.faces, _GAUSSIANS)
     nearest = scipy.spatial.cKDTree(shape.verts).query(points)[1]
     spacing = point_spacing(points)
-    as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
     scales = _SPREAD * spacing[:, None] * np.array([1.0, 1.0, _FLATNESS])
-    means = as_tensor(points)
+    means = float32(points)
     return CanonicalObject(
         means,
         torch.zeros_like(means),
-        matrix_to_quat(as_tensor(frames_from_normals(normals))),
-        as_tensor(scales),
+        matrix_to_quat(float32(frames_from_normals(normals))),
+        float32(scales),
         torch.full((len(means),), 0.95),
-        as_tensor(shape.colors[nearest]),
-        as_tensor(normals),
+        float32(shape.colors[nearest]),
+        float32(normals),
         torch.zeros(len(means), N_PARTS),  # nothing shades it
     )
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.geometry.arrays import float32
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import HandModel, mirror_axis_angle, mirror_points, mirror_rotation, shared_betas
 from bigs.preprocess.frames.frame_ranges import frame_ranges
@@ -87,9 +88,8 @@ def _from_parameters(side: Side, dump: ParameterDump, hand_models: Mapping[Side,
 
 def _from_geometry(side: Side, dump: GeometryDump, hand_models: Mapping[Side, HandModel]) -> HandTrack:
     model, right = hand_models[side], hand_models["right"]
-    as_tensor = lambda array: torch.as_tensor(array[dump.valid], dtype=torch.float32)  # noqa: E731
-    joints = as_tensor(dump.joints)
-    vertices = None if dump.vertices is None else as_tensor(dump.vertices)
+    joints = float32(dump.joints[dump.valid])
+    vertices = None if dump.vertices is None else float32(dump.vertices[dump.valid])
     if side == "left":
         joints = mirror_points(joints)
         vertices = None if vertices is None else mirror_points(vertices)

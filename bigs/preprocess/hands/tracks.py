@@ -12,6 +12,7 @@ import torch
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.tracks import fill_rotations, fill_vectors
+from bigs.geometry.arrays import float32
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand import HandModel, mirror_axis_angle, mirror_points, mirror_rotation, shared_betas
 from bigs.hand.model import HandOutput
@@ -74,8 +75,7 @@ def fit_hands(
         if side == "left":
             rays[i, ..., 0] *= -1.0
     trust = np.stack([keypoints[side].confidence for side in sides])
-    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
-    fit = fit_rays(skeleton, as_tensor(rays), as_tensor(trust), config, fps)
+    fit = fit_rays(skeleton, float32(rays), float32(trust), config, fps)
     tracks: dict[Side, HandTrack] = {}
     for i, side in enumerate(sides):
         valid = (fit.explained[i] >= config.joints_needed).numpy()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bigs.data.base import Clip, HandTrack
 from bigs.data.touching import masks_touch
+from bigs.geometry.arrays import float32
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.smoothing import interpolated_frames, smooth_rotations, smooth_vectors
 from bigs.geometry.surface import inlier_points
@@ -79,14 +80,13 @@ def hand_in_camera(
     `model` is that side's own model: its rest wrist and mean pose are part of the track's convention.
     """
     to_cam = torch.as_tensor(cam_from_world, dtype=torch.float32)
-    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
-    orient = to_cam[:, :3, :3] @ axis_angle_to_matrix(as_tensor(track.global_orient))
-    pose = model.pose_matrices(as_tensor(track.hand_pose))
-    wrist_world = model.rest_joints(as_tensor(track.betas))[0] + as_tensor(track.transl)
+    orient = to_cam[:, :3, :3] @ axis_angle_to_matrix(float32(track.global_orient))
+    pose = model.pose_matrices(float32(track.hand_pose))
+    wrist_world = model.rest_joints(float32(track.betas))[0] + float32(track.transl)
     wrist = (to_cam[:, :3, :3] @ wrist_world[..., None])[..., 0] + to_cam[:, :3, 3]
     if model.side == "left":
         orient, pose = mirror_rotation(orient), mirror_rotation(pose)
-    return HandStart(orient, pose, wrist, _trust(track.valid, as_tensor(track.transl), config))
+    return HandStart(orient, pose, wrist, _trust(track.valid, float32(track.transl), config))
 
 
 def object_in_camera(clip: Clip, config: InitialConfig) -> ObjectStart:

@@ -15,6 +15,7 @@ import torch
 import bigs
 from bigs.atomic import atomic_write
 from bigs.data.base import Clip
+from bigs.geometry.arrays import float32
 from bigs.models.poses import PoseErrors
 from bigs.motion.tracker import GivenPoses, TrackedMotion, track
 from bigs.train.plan.config import ObjectMotionStage
@@ -75,8 +76,7 @@ def pose_errors(motion: TrackedMotion) -> PoseErrors:
     """The poses' errors as a scene counts them."""
     turn = np.linalg.cholesky(motion.covariance[:, :3, :3])
     across = np.sqrt(np.einsum("tii->t", motion.covariance[:, 3:5, 3:5]) / 2.0)
-    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
-    return PoseErrors(as_tensor(turn), as_tensor(across / motion.transl[:, 2]))
+    return PoseErrors(float32(turn), float32(across / motion.transl[:, 2]))
 
 
 def turn_errors(motion: TrackedMotion) -> np.ndarray:

@@ -11,6 +11,7 @@ import scipy.spatial
 import torch
 from torch import Tensor
 
+from bigs.geometry.arrays import float32
 from bigs.geometry.coverage import coverage_by_direction, sphere_directions
 from bigs.guidance.cameras import (
     Orbit,
@@ -56,8 +57,7 @@ def coverage_of(normals: Tensor, seen: Tensor) -> Coverage:
     """The coverage of Gaussians with unit normals [N, 3], of which those marked in `seen` [N] were seen."""
     directions = sphere_directions(_DIRECTIONS)
     covered = coverage_by_direction(normals.numpy().astype(np.float64), seen.numpy(), directions)
-    as_tensor = lambda array: torch.as_tensor(array, dtype=torch.float32)  # noqa: E731
-    return Coverage(seen, as_tensor(directions), as_tensor(covered))
+    return Coverage(seen, float32(directions), float32(covered))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bigs.data.base import Clip
+from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import face_areas, frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.geometry.surface import extract_mesh
@@ -153,16 +154,15 @@ def _far_side(
     count = min(_COLORS_FROM, len(whole.points))
     nearest = scipy.spatial.cKDTree(whole.points).query(points, k=[*range(1, count + 1)])[1]
     sigma = obj.scale_per_spacing * spacing
-    as_tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)  # noqa: E731
-    centers = as_tensor(points - obj.flatness * sigma * normals)
-    scales: Tensor = as_tensor(sigma * np.array([1.0, 1.0, obj.flatness]))
+    centers = float32(points - obj.flatness * sigma * normals)
+    scales: Tensor = float32(sigma * np.array([1.0, 1.0, obj.flatness]))
     return CanonicalObject(
         centers,
         torch.zeros_like(centers),
-        matrix_to_quat(as_tensor(frames_from_normals(normals))),
+        matrix_to_quat(float32(frames_from_normals(normals))),
         scales.expand(len(centers), 3),
         torch.full((len(centers),), obj.opacity),
-        as_tensor(whole.colors[nearest].mean(1)),
-        as_tensor(normals),
+        float32(whole.colors[nearest].mean(1)),
+        float32(normals),
         canonical.weights[torch.as_tensor(scipy.spatial.cKDTree(means).query(points)[1])],
     )

@@ -11,7 +11,7 @@ from toy_scenes import cube_scene
 
 from bigs.checks import InputError
 from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, rotation_angle
-from bigs.hand import mirror_rotation, procedural_hand
+from bigs.hand import builtin_hand, mirror_rotation
 from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
@@ -27,7 +27,7 @@ FRAMES = 24
 
 def turning_scene(wander: float = 0.0) -> Scene:
     """The held cube turning about the camera's vertical; the hands' estimates wander by `wander` metres."""
-    scene = cube_scene({side: procedural_hand(side) for side in ("right", "left")}, frames=FRAMES)
+    scene = cube_scene({side: builtin_hand(side) for side in ("right", "left")}, frames=FRAMES)
     turn = torch.linspace(0, 2.0, FRAMES)
     rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
     noise = wander * torch.randn(FRAMES, 3, generator=torch.Generator().manual_seed(1))
@@ -182,7 +182,7 @@ def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
 
 
 def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
-    scene = cube_scene({"right": procedural_hand()})
+    scene = cube_scene({"right": builtin_hand()})
     step = Step(scene, None, {}, Selection(torch.arange(3)))
     poses = scene.hand_poses["right"]
     assert depth_prior(step) == 0, "nothing is expected of anything yet"

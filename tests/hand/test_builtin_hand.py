@@ -5,8 +5,17 @@ import pytest
 import torch
 import trimesh
 
-from bigs.hand import HandModel, load_hand_models, procedural_hand
-from bigs.hand.anatomy import FINGERS, WRIST, chain_points, finger_distance, hand_distance, rest_joints
+from bigs.hand import HandModel, builtin_hand, load_hand_models
+from bigs.hand.builtin import FILE
+from tools.builtin_hand.anatomy import (
+    FINGERS,
+    WRIST,
+    chain_points,
+    finger_distance,
+    hand_distance,
+    rest_joints,
+)
+from tools.builtin_hand.arrays import right_hand_arrays
 
 FINGER_OF_SHAPE = {"thumb": 5, "pinky": 8}
 
@@ -14,6 +23,14 @@ FINGER_OF_SHAPE = {"thumb": 5, "pinky": 8}
 @pytest.fixture(scope="module")
 def mesh(right: HandModel) -> trimesh.Trimesh:
     return trimesh.Trimesh(right.v_template.numpy(), right.faces.numpy(), process=False)
+
+
+def test_the_file_is_what_its_script_makes() -> None:
+    made = right_hand_arrays()
+    with np.load(FILE) as stored:
+        assert set(stored) == set(made)
+        for name, values in stored.items():
+            np.testing.assert_allclose(values, made[name], rtol=0, atol=1e-6, err_msg=name)
 
 
 def test_is_one_closed_outward_surface(mesh: trimesh.Trimesh) -> None:
@@ -115,5 +132,5 @@ def test_flexion_brings_the_fingertips_to_the_palm(right: HandModel) -> None:
 def test_is_the_default_and_the_same_every_time(right: HandModel) -> None:
     hands = load_hand_models(None)
     assert torch.equal(hands["right"].v_template.double(), right.v_template)
-    assert torch.equal(procedural_hand("left").v_template, hands["left"].v_template)
+    assert torch.equal(builtin_hand("left").v_template, hands["left"].v_template)
     assert hands["left"].side == "left"

@@ -1,16 +1,14 @@
-"""A generated hand, so that everything runs without a model file.
+"""The built-in hand's arrays, from its anatomy.
 
 Joint tree, axes and number of shapes as in a MANO-format file; no pose correctives, flat mean pose.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 
-from bigs.hand.anatomy import (
+from bigs.hand.model import MANO_PARENTS
+from tools.builtin_hand.anatomy import (
     FINGERS,
     WRIST,
     capsule_distance,
@@ -22,9 +20,7 @@ from bigs.hand.anatomy import (
     palm_capsules,
     rest_joints,
 )
-from bigs.hand.model import MANO_PARENTS, HandModel
-from bigs.hand.remesh import adjacency, implicit_mesh, remesh
-from bigs.types import Side
+from tools.builtin_hand.remesh import adjacency, implicit_mesh, remesh
 
 # Edges on a finger and on the palm, metres: about ten vertices around a finger, about 1000 in all.
 FINGER_EDGE = 0.0050
@@ -35,14 +31,8 @@ FIRST_BONE = {name: 1 + 3 * i for i, name in enumerate(FINGERS)}
 TIP_ORDER = ("thumb", "index", "middle", "ring", "pinky")
 
 
-def procedural_hand(side: Side = "right") -> HandModel:
-    """The built-in hand; the left one is the mirrored right one. Made once per process, about a second."""
-    right = HandModel("right", **_right_hand_arrays())
-    return right if side == "right" else right.mirrored()
-
-
-@lru_cache(maxsize=1)
-def _right_hand_arrays() -> dict[str, Any]:
+def right_hand_arrays() -> dict[str, np.ndarray]:
+    """What `HandModel` takes, but for the correctives, of which there are none; in about a second."""
     margin = 0.006
     joints = rest_joints()
     tips = np.array([chain_points(finger)[3] for finger in FINGERS.values()])
@@ -57,7 +47,6 @@ def _right_hand_arrays() -> dict[str, Any]:
         "v_template": vertices,
         "faces": faces,
         "shapedirs": _shape_directions(vertices, weights, joints),
-        "posedirs": np.zeros((len(vertices), 3, 9 * (len(MANO_PARENTS) - 1))),
         "J_regressor": _joint_regressor(vertices, weights, joints),
         "lbs_weights": weights,
         "hands_mean": np.zeros((len(MANO_PARENTS) - 1, 3)),

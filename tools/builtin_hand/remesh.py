@@ -13,6 +13,8 @@ import numpy as np
 import scipy.sparse
 from skimage.measure import marching_cubes
 
+from bigs.geometry.mesh import vertex_normals
+
 Field = Callable[[np.ndarray], np.ndarray]
 
 
@@ -54,14 +56,6 @@ def remesh(
         for _ in range(3):
             vertices = _project(_relaxed(vertices, faces), distance)
     return vertices, faces
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals [V, 3]."""
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], _face_normals(vertices, faces))
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""How `bigs/hand/builtin_hand.npz` is made; see `__main__.py`."""
