@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 from bigs.raster.settings import RasterSettings
 
 __all__ = [
+    "DistanceState",
     "RasterState",
     "__version__",
     "cut_patches",
     "default_settings",
+    "distances_backward",
+    "distances_forward",
     "fma_peak_gflops",
     "harmonics_backward",
     "harmonics_forward",
@@ -20,12 +23,16 @@ __all__ = [
     "pose_forward",
     "rasterize_backward",
     "rasterize_forward",
+    "rotations_backward",
+    "rotations_forward",
     "simd_level",
     "terms_alone",
     "terms_alone_backward",
     "terms_together",
     "terms_together_backward",
     "time_engine",
+    "tree_backward",
+    "tree_forward",
 ]
 
 __version__: str
@@ -187,6 +194,37 @@ def lay_patches(
     Templates are grey values [N, S], slopes [N, S, 2] and weights [N, S]; starts [N, 2], warps [N, 2, 2].
     `limits` are the least share shown, the least likeness, the most moved and the most unsure, in pixels.
     """
+def rotations_forward(arrays: tuple[NDArray[Any]]) -> NDArray[Any]:
+    """Flat matrices of rotation vectors [.., 3], the only entry."""
+
+def rotations_backward(arrays: tuple[NDArray[Any], NDArray[Any]]) -> NDArray[Any]:
+    """Flat gradients of vectors [.., 3] from those of their matrices [.., 3, 3]."""
+
+# rotations [B, K, 3, 3], rest_joints [K, 3] or [B, K, 3], root [B, 3].
+_Tree = tuple[NDArray[Any], ...]
+
+def tree_forward(arrays: _Tree, parents: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Flat joints [B, K, 3] and bones [B, K, 4, 4]."""
+
+def tree_backward(
+    arrays: _Tree, parents: tuple[int, ...], pulls: list[NDArray[Any] | None]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Flat gradients of rotations, rest_joints and root from those of joints and bones."""
+
+@final
+class DistanceState:
+    """What distances were measured and how they change. Opaque; usable any number of times."""
+
+# points [B, V, 3], rotations [B, 3, 3], centers [B, 3], scale [], values [Z, Y, X], bounds [2, 3].
+_Distances = tuple[NDArray[Any], ...]
+
+def distances_forward(arrays: _Distances) -> tuple[NDArray[Any], DistanceState]:
+    """Flat distances [B, V]."""
+
+def distances_backward(
+    state: DistanceState, arrays: _Distances, v_distances: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Flat gradients of points, rotations, centers and scale from those of the distances."""
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

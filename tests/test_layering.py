@@ -45,10 +45,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "torch_files": {"checks", "archives", "pickle_records", "unpickle"},
     "weights": {"checks", "files", "torch_files"},
     "_raster": {"raster"},  # the compiled module's stub names the settings class
-    "geometry": BELOW,
-    "raster": BELOW | {"geometry", "_raster"},
     "fused": {"_raster"},
-    "hand": BELOW | {"geometry"},
+    "geometry": BELOW | {"fused"},
+    "raster": BELOW | {"geometry", "_raster"},
+    "hand": BELOW | {"geometry", "fused"},
     "fields": BELOW | {"geometry"},
     "losses": BELOW | {"geometry"},
     "guidance": BELOW | {"geometry"},

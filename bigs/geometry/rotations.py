@@ -7,8 +7,6 @@ identity and at pi.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
@@ -16,11 +14,8 @@ from kornia.geometry.conversions import (
 )
 from torch import Tensor
 
-# v @ _CROSS is the matrix, row by row, that multiplies like v x.
-_CROSS = torch.tensor(
-    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
-    dtype=torch.float32,
-)
+from bigs.fused.joints import rotations
+
 # 1 + vec(R) @ _OUTER on the diagonal, and the same without 1 off it, is 4 q q^T for the quaternion q of R.
 _OUTER = torch.tensor(
     [
@@ -46,17 +41,11 @@ _LEFT = torch.tensor(
     ],
     dtype=torch.float32,
 )
-# Under the root of a squared angle, which has no gradient at zero; far below any angle's accuracy.
-_TINY = 1e-30
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     """Rotation vectors [..., 3] (radians) to matrices [..., 3, 3], by Rodrigues' formula."""
-    cross = (axis_angle @ _CROSS.to(axis_angle)).unflatten(-1, (3, 3))
-    turns = (axis_angle.square().sum(-1)[..., None, None] + _TINY).sqrt() / math.pi
-    bend = 0.5 * torch.sinc(0.5 * turns).square()
-    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
-    return identity + torch.sinc(turns) * cross + bend * (cross @ cross)
+    return rotations(axis_angle)
 
 
 def matrix_to_axis_angle(matrices: Tensor) -> Tensor:

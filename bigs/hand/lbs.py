@@ -6,10 +6,11 @@ that act on column vectors, each relative to its parent's frame. Nothing here kn
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor
+
+from bigs.fused.joints import pose_tree
+from bigs.fused.posing import Posing, skin
 
 
 def shape_vertices(template: Tensor, shapedirs: Tensor, betas: Tensor) -> Tensor:
@@ -34,14 +35,6 @@ def pose_corrective(posedirs: Tensor, hand_pose: Tensor) -> Tensor:
     return offsets.reshape(*features.shape[:-1], *posedirs.shape[:2])
 
 
-def tree_levels(parents: tuple[int, ...]) -> list[list[int]]:
-    """The joints of each depth, root first; kinematics runs level by level, all fingers at once."""
-    depth = [0] * len(parents)
-    for joint, parent in enumerate(parents[1:], start=1):
-        depth[joint] = depth[parent] + 1
-    return [[j for j, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
-
-
 def forward_kinematics(
     rotations: Tensor, rest_joints: Tensor, parents: tuple[int, ...], root: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -56,24 +49,7 @@ def forward_kinematics(
     Returns:
         posed joints [T, K, 3] and bone transforms [T, K, 4, 4] that carry rest points to posed points.
     """
-    frames = rotations.shape[0]
-    rest = rest_joints.expand(frames, -1, -1)
-    levels = tree_levels(parents)
-    turned: list[Tensor] = [rotations[:, :1]]
-    placed: list[Tensor] = [root[:, None]]
-    row_of = {0: 0}
-    for above, level in pairwise(levels):
-        above_rows = [above.index(parents[j]) for j in level]
-        bones = rest[:, level] - rest[:, [parents[j] for j in level]]
-        parent_turn = turned[-1][:, above_rows]
-        placed.append(placed[-1][:, above_rows] + (parent_turn @ bones[..., None])[..., 0])
-        turned.append(parent_turn @ rotations[:, level])
-        row_of |= {j: len(row_of) + i for i, j in enumerate(level)}
-    rows = [row_of[j] for j in range(len(parents))]
-    joints = torch.cat(placed, dim=1)[:, rows]
-    linear = torch.cat(turned, dim=1)[:, rows]
-    translation = joints - (linear @ rest[..., None])[..., 0]
-    return joints, _with_last_row(torch.cat([linear, translation[..., None]], dim=-1))
+    return pose_tree(rotations, rest_joints, parents, root)
 
 
 def blend_transforms(weights: Tensor, bone_transforms: Tensor) -> Tensor:
@@ -102,15 +78,7 @@ def skin_points(points: Tensor, weights: Tensor, bone_transforms: Tensor) -> Ten
     Returns:
         [T, N, 3] metres.
     """
-    frames, joints = bone_transforms.shape[:2]
-    if points.dim() == 2:
-        # One matrix product over (joint, homogeneous coordinate) pairs; no [T, N, 3, 4] is ever formed.
-        homogeneous = torch.cat([points, points.new_ones(len(points), 1)], dim=-1)
-        features = (weights[:, :, None] * homogeneous[:, None, :]).flatten(1)
-        matrix = bone_transforms[:, :, :3].transpose(2, 3).reshape(frames, joints * 4, 3)
-        return features @ matrix
-    upper = (weights @ bone_transforms[:, :, :3].reshape(frames, joints, 12)).reshape(frames, -1, 3, 4)
-    return (upper[..., :3] @ points[..., None])[..., 0] + upper[..., 3]
+    return skin(Posing(points, weights, bone_transforms))
 
 
 def _with_last_row(upper: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -76,13 +77,15 @@ def relative_scores(
         One score per frame; None where either side is not finite.
     """
     generator = torch.Generator().manual_seed(seed)
-    scores: list[ShapeScore | None] = []
-    for t in range(len(gt_object)):
-        p, g = pred_object[t] - pred_origin[t], gt_object[t] - gt_origin[t]
-        finite = np.isfinite(p).all() and np.isfinite(g).all()
-        p, g = draw(p, POINTS_PER_FRAME, generator), draw(g, POINTS_PER_FRAME, generator)
-        scores.append(shape_score(p, g) if finite else None)
-    return scores
+    waiting: list[Future[ShapeScore] | None] = []
+    # Draws depend on each other, scores do not, and searching for neighbours needs no interpreter.
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for t in range(len(gt_object)):
+            p, g = pred_object[t] - pred_origin[t], gt_object[t] - gt_origin[t]
+            finite = np.isfinite(p).all() and np.isfinite(g).all()
+            p, g = draw(p, POINTS_PER_FRAME, generator), draw(g, POINTS_PER_FRAME, generator)
+            waiting.append(pool.submit(shape_score, p, g) if finite else None)
+        return [None if score is None else score.result() for score in waiting]
 
 
 def relative_chamfer(

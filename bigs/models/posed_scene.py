@@ -81,6 +81,10 @@ class PosedScene:
         pose = self.object
         return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
+    def object_distances(self, points: Tensor) -> Tensor:
+        """Signed distances [B, N] of camera points [B, N, 3] from the object's surface, metres."""
+        return self._scene.object_distance.of_moving(points, *self.object)
+
     def posed(
         self, canonical: Mapping[Entity, CanonicalHand | CanonicalObject], labels: bool = False
     ) -> Gaussians:

@@ -8,7 +8,6 @@ from bigs.hand.lbs import (
     pose_corrective,
     shape_vertices,
     skin_points,
-    tree_levels,
 )
 from bigs.hand.model import MANO_PARENTS
 
@@ -47,10 +46,6 @@ def chain_of_transforms(pose: torch.Tensor, rest: torch.Tensor, root: torch.Tens
             total[:3, 3] -= total[:3, :3] @ rest[joint]
             out[t, joint] = total
     return out
-
-
-def test_tree_levels_are_the_phalanges() -> None:
-    assert tree_levels(MANO_PARENTS) == [[0], [1, 4, 7, 10, 13], [2, 5, 8, 11, 14], [3, 6, 9, 12, 15]]
 
 
 def test_forward_kinematics_is_the_product_of_joint_transforms() -> None:

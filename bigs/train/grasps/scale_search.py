@@ -60,11 +60,8 @@ def search_object_scale(
     hidden = torch.zeros(len(factors))
     for c, factor in enumerate(factors):
         scene.object_poses.log_scale.copy_(start + factor.log())
-        scale = scene.object_poses.log_scale.exp()
         for side, verts in hands.items():
-            gaps[side][c] = surface_gaps(
-                scale * scene.object_distance(scene.at(frames).in_object_frame(verts))
-            )
+            gaps[side][c] = surface_gaps(scene.at(frames).object_distances(verts))
         hidden[c] = stage.labels_weight * occlusion()
     scene.object_poses.log_scale.copy_(start)
     costs = _costs(gaps, touching) + hidden

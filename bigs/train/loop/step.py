@@ -216,12 +216,7 @@ class Step:
     @cached_property
     def object_distances(self) -> dict[Side, Tensor]:
         """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
-        scale = self.scene.object_poses.log_scale.exp()
-        return {
-            side: scale
-            * self.scene.object_distance(self.posed_clip.in_object_frame(self.posed_clip.verts(side)))
-            for side in self.scene.sides
-        }
+        return {side: self.posed_clip.object_distances(self.posed_clip.verts(side)) for side in self.scene.sides}
 
     @property
     def has_object(self) -> bool:

@@ -19,6 +19,8 @@
 )]
 
 mod checks;
+pub mod distance;
+pub mod joints;
 mod lanes;
 pub mod pixels;
 pub mod pose;

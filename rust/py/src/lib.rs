@@ -4,6 +4,7 @@ mod convert;
 mod measure;
 mod pixels;
 mod pose;
+mod poses;
 mod sh;
 mod track;
 
@@ -322,6 +323,13 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_forward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_backward, m)?)?;
+    m.add_class::<poses::DistanceState>()?;
+    m.add_function(wrap_pyfunction!(poses::rotations_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(poses::rotations_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(poses::tree_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(poses::tree_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(poses::distances_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(poses::distances_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone, m)?)?;
