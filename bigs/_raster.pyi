@@ -194,6 +194,7 @@ def lay_patches(
     Templates are grey values [N, S], slopes [N, S, 2] and weights [N, S]; starts [N, 2], warps [N, 2, 2].
     `limits` are the least share shown, the least likeness, the most moved and the most unsure, in pixels.
     """
+
 def rotations_forward(arrays: tuple[NDArray[Any]]) -> NDArray[Any]:
     """Flat matrices of rotation vectors [.., 3], the only entry."""
 

@@ -216,7 +216,9 @@ class Step:
     @cached_property
     def object_distances(self) -> dict[Side, Tensor]:
         """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
-        return {side: self.posed_clip.object_distances(self.posed_clip.verts(side)) for side in self.scene.sides}
+        return {
+            side: self.posed_clip.object_distances(self.posed_clip.verts(side)) for side in self.scene.sides
+        }
 
     @property
     def has_object(self) -> bool:
