@@ -161,9 +161,14 @@ class VisualHull:
 
 def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
     """Distance [N] of points to the convex hull of `cloud` [M, 3], along its faces; negative inside."""
+    return distance_to_planes(points, scipy.spatial.ConvexHull(cloud).equations)
+
+
+def distance_to_planes(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """The largest signed distance [N] of points [N, 3] to planes [M, 4]: unit normal and offset."""
     largest = np.full(len(points), -np.inf)
-    for equation in scipy.spatial.ConvexHull(cloud).equations:
-        np.maximum(largest, points @ equation[:3] + equation[3], out=largest)
+    for plane in planes:
+        np.maximum(largest, points @ plane[:3] + plane[3], out=largest)
     return largest
 
 

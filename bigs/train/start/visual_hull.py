@@ -15,6 +15,7 @@ from bigs.geometry.surface import (
     VisualHull,
     blend_with_points,
     convex_distance,
+    distance_to_planes,
     empty_grid,
     point_normals,
     silhouette_around_points,
@@ -71,16 +72,32 @@ class ObjectHull:
     ) -> DistanceGrid:
         """The surface through points [N, 3] with normals, within their convex hull or little more.
 
-        Beyond that hull only what nearly always shows as object stays, up to twice `allowance` metres: the
-        far side of an object that was never turned does, the space that a hand always covers does not.
+        Beyond faces of that hull that no camera looked at, what nearly always shows as object stays, up to
+        twice `allowance` metres: the far side of an object that was never turned does, the space that a hand
+        always covers does not. Beyond the others it would have hidden the points.
         """
         distance = self.grid.values.ravel().copy()
         doubtful = np.flatnonzero(distance < config.surface_reach)
-        beyond = convex_distance(self.grid.points()[doubtful], points) - config.surface_margin
-        relief = allowance * ((self.shown[doubtful] - config.surface_shown) / 0.1).clip(0.0)
-        distance[doubtful] = np.maximum(distance[doubtful], beyond - relief)
+        faces = scipy.spatial.ConvexHull(points)
+        planes = faces.equations
+        least = min(config.seen_frames, len(self.views.shown))
+        turned = self._frames_facing(points[faces.simplices].mean(1), planes[:, :3]) < least
+        corners = self.grid.points()[doubtful]
+        beyond = distance_to_planes(corners, planes)
+        if turned.any() and not turned.all():
+            relief = allowance * ((self.shown[doubtful] - config.surface_shown) / 0.1).clip(0.0)
+            behind = distance_to_planes(corners, planes[turned]) - relief
+            beyond = np.maximum(distance_to_planes(corners, planes[~turned]), behind)
+        distance[doubtful] = np.maximum(distance[doubtful], beyond - config.surface_margin)
         carved = DistanceGrid(distance.reshape(self.grid.values.shape), self.grid.origin, self.grid.spacing)
         return blend_with_points(carved, points, normals, config.surface_reach)
+
+    def _frames_facing(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """In how many frames [N] planes at places [N, 3] face the camera, whatever hides them."""
+        facing = [
+            (self.views.directions(t, places) * normals).sum(-1) > 0.0 for t in range(len(self.views.shown))
+        ]
+        return np.sum(facing, axis=0)
 
 
 def find_object_hull(
