@@ -83,6 +83,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "interpolated_trust": _SHARE,
         "surface_resolution": Range(8, 1000),
         "surface_agreeing": _COUNT,
+        "surface_smoothing": Range(0.0, 100.0),
         "surface_shown": _SHARE,
         "seen_frames": _COUNT,
         "surface_guessed": _SHARE,

@@ -49,6 +49,9 @@ class InitialConfig:
     # seen fills a grip that a hand is in.
     surface_solid: float = 0.015
     surface_guessed: float = 0.1
+    # The surface is smoothed over this many cells of its grid: errors of points and masks make it rough,
+    # and Gaussians on a rough surface look torn from other views.
+    surface_smoothing: float = 1.0
     # The mesh ends this far from any seen or measured surface, metres.
     surface_kept: float = 0.03
 

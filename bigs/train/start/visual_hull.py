@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.spatial
+from scipy.ndimage import gaussian_filter
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
@@ -90,7 +91,8 @@ class ObjectHull:
             beyond = np.maximum(distance_to_planes(corners, planes[~turned]), behind)
         distance[doubtful] = np.maximum(distance[doubtful], beyond - config.surface_margin)
         carved = DistanceGrid(distance.reshape(self.grid.values.shape), self.grid.origin, self.grid.spacing)
-        return blend_with_points(carved, points, normals, config.surface_reach)
+        blended = blend_with_points(carved, points, normals, config.surface_reach)
+        return replace(blended, values=gaussian_filter(blended.values, config.surface_smoothing))
 
     def _frames_facing(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """In how many frames [N] planes at places [N, 3] face the camera, whatever hides them."""

@@ -7,14 +7,14 @@ import pytest
 
 from bigs.geometry.coverage import ObjectViews
 from bigs.geometry.surface import DistanceGrid, convex_distance, empty_grid
-from bigs.train.start.carving import Carving
+from bigs.train.start.visual_hull import ObjectHull
 from bigs.train.start.initial import InitialConfig
 
 HALF = np.array([0.03, 0.03, 0.02])
 CONFIG = InitialConfig()
 
 
-def seen_from_the_front(frames: int) -> Carving:
+def seen_from_the_front(frames: int) -> ObjectHull:
     """A box before a camera that looks along +z; masks say nothing of its depth, points lie on its front."""
     grid = empty_grid(np.full(3, -0.06), np.full(3, 0.06), 48)
     corners = grid.points()
@@ -31,7 +31,7 @@ def seen_from_the_front(frames: int) -> Carving:
         np.tile([0.0, 0.0, 0.7], (frames, 1)),
     )
     points = np.stack([x, y, z], axis=-1)
-    return Carving(
+    return ObjectHull(
         DistanceGrid(hull.reshape(grid.values.shape), grid.origin, grid.spacing),
         (hull < 0.0).astype(float),
         points,
@@ -42,8 +42,8 @@ def seen_from_the_front(frames: int) -> Carving:
 
 @pytest.mark.parametrize("frames", [1, 5])
 def test_it_is_closed_behind_its_points_and_not_before_them(frames: int) -> None:
-    carving = seen_from_the_front(frames)
-    surface = carving.closed(CONFIG, carving.points, carving.normals, CONFIG.surface_reach)
+    hull = seen_from_the_front(frames)
+    surface = hull.closed(CONFIG, hull.points, hull.normals, CONFIG.surface_reach)
     axis = np.zeros((2, 3))
     axis[:, 2] = [-HALF[2] - 0.006, 0.012]
     index = np.round((axis - surface.origin) / surface.spacing).astype(int)
@@ -53,7 +53,7 @@ def test_it_is_closed_behind_its_points_and_not_before_them(frames: int) -> None
 
 
 def test_without_allowance_it_ends_at_the_points_hull() -> None:
-    carving = seen_from_the_front(5)
-    surface = carving.closed(CONFIG, carving.points, carving.normals, 0.0)
+    hull = seen_from_the_front(5)
+    surface = hull.closed(CONFIG, hull.points, hull.normals, 0.0)
     inside = surface.points()[surface.values.ravel() < 0.0]
-    assert convex_distance(inside, carving.points).max() <= CONFIG.surface_margin
+    assert convex_distance(inside, hull.points).max() <= CONFIG.surface_margin
