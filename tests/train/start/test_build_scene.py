@@ -198,7 +198,7 @@ def test_without_object_masks_the_points_serve(tiny: Clip, both_hands: dict[Side
     hidden = replace(tiny, mask_areas=tiny.mask_areas | {"object": np.zeros(len(tiny), dtype=int)})
     scene, notes, *_ = build(hidden, both_hands)
     assert len(notes) == 1
-    assert notes[0].startswith("object surface from masks: no frame shows the object; the points'")
+    assert notes[0].startswith("object surface from masks: no frame shows the object; using the points'")
     hull = trimesh.Trimesh(scene.object_surface.verts.numpy(), scene.object_surface.faces.numpy())
     assert hull.is_watertight and hull.volume > 0
 
