@@ -15,6 +15,13 @@ class FreeGaussians(nn.Module):
     than the rendering. Optimisation goes on with a displacement, size, opacity and colour for each Gaussian.
     """
 
+    base_means: Tensor
+    base_quats: Tensor
+    base_log_scales: Tensor
+    opacity_logits: Tensor
+    color_logits: Tensor
+    normals: Tensor
+
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; `start` fills it."""
         super().__init__()

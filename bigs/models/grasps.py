@@ -22,6 +22,13 @@ class Grasps(nn.Module):
     mirror shows it; positions are in the object's own frame, metres at its initial size.
     """
 
+    of_frame: Tensor
+    certainty: Tensor
+    slack: Tensor
+    base_orient: Tensor
+    base_pose: Tensor
+    base_position: Tensor
+
     def __init__(self, n_frames: int, *, mirrored: bool) -> None:
         """No grasp yet. `mirrored` for a left hand."""
         super().__init__()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.hand import HandModel
@@ -17,13 +18,16 @@ class HandDetail(FreeGaussians):
     How its Gaussians follow the shape and the bones is settled: it stays as the field left it.
     """
 
+    shapedirs: Tensor
+    posedirs: Tensor | None
+    base_weights: Tensor
+
     def __init__(self, model: HandModel, splats: CanonicalHand) -> None:
         """`model` is the right hand; `splats` says how many Gaussians, and how they follow shape and pose."""
         super().__init__(len(splats.points))
         self.model = model
         self.register_buffer("shapedirs", splats.shapedirs.detach().clone(), persistent=False)
-        has_posedirs = splats.posedirs is not None
-        posedirs = splats.posedirs.detach().clone() if has_posedirs else None
+        posedirs = None if splats.posedirs is None else splats.posedirs.detach().clone()
         self.register_buffer("posedirs", posedirs, persistent=False)
         self.register_buffer("base_weights", splats.weights.detach().clone())
 

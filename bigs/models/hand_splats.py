@@ -51,6 +51,13 @@ class HandSplatsConfig:
 class HandSplats(nn.Module):
     """A canonical right hand: Gaussians on the (subdivided) template surface, changed by triplane fields."""
 
+    base_points: Tensor
+    shapedirs: Tensor
+    posedirs: Tensor
+    base_weights: Tensor
+    base_quats: Tensor
+    base_log_scales: Tensor
+
     def __init__(self, model: HandModel, config: HandSplatsConfig) -> None:
         """`model` is the right hand."""
         super().__init__()

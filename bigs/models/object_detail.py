@@ -18,6 +18,8 @@ _SIGMA_PER_SPACING = 0.6
 class ObjectDetail(FreeGaussians):
     """A canonical object without a field; replaces `ObjectSplats` in a scene."""
 
+    weights: Tensor
+
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; see `split_object`."""
         super().__init__(count)

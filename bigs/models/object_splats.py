@@ -51,6 +51,13 @@ class Anchors(NamedTuple):
 class ObjectSplats(nn.Module):
     """A canonical object: Gaussians on an initial surface, changed by triplane fields."""
 
+    base_points: Tensor
+    normals: Tensor
+    base_quats: Tensor
+    base_log_scales: Tensor
+    color_logits: Tensor
+    weights: Tensor
+
     def __init__(
         self, points: np.ndarray, normals: np.ndarray, colors: np.ndarray, config: ObjectSplatsConfig
     ) -> None:

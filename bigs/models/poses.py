@@ -33,6 +33,9 @@ class ObjectFrames(NamedTuple):
 class RayPositions(nn.Module):
     """Positions in camera space as a point on the z = 1 plane and a logarithmic depth."""
 
+    base_ray: Tensor
+    base_log_depth: Tensor
+
     def __init__(self, positions: Tensor) -> None:
         """`positions` [T, 3], metres, z > 0: where the residuals start from."""
         super().__init__()
@@ -81,6 +84,13 @@ class RayPositions(nn.Module):
 
 class HandPoses(nn.Module):
     """One hand's poses over a clip; a left hand's rotations are stored mirrored."""
+
+    base_orient: Tensor
+    base_pose: Tensor
+    estimated_pose: Tensor
+    estimated_log_depth: Tensor
+    expected_log_depth: Tensor
+    has_expected_depth: Tensor
 
     def __init__(self, global_orient: Tensor, hand_pose: Tensor, wrist: Tensor) -> None:
         """Starts: rotations [T, 3, 3] and [T, 15, 3, 3], wrist joint positions [T, 3] in metres."""
@@ -155,6 +165,11 @@ class ObjectPoses(nn.Module):
     Residuals of turn and ray count in usual errors of an estimate. Where the start is known better they are
     scaled down alike, so that one learning rate and one prior suit frames of all kinds.
     """
+
+    base_orient: Tensor
+    turn_freedom: Tensor
+    ray_freedom: Tensor
+    measured: Tensor
 
     def __init__(self, rotations: Tensor, centers: Tensor, errors: PoseErrors | None = None) -> None:
         """Starts: rotations [T, 3, 3] and positions [T, 3] (metres) of the canonical origin.

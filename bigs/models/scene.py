@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import dataclass
 
 import torch
@@ -12,8 +12,10 @@ from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.grasps import Grasps
+from bigs.models.hand_detail import HandDetail
 from bigs.models.hand_splats import HandSplats, pose_splats
 from bigs.models.lighting import Lighting
+from bigs.models.object_detail import ObjectDetail
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.posed_scene import PosedScene
 from bigs.models.poses import HandFrames, HandPoses, ObjectPoses
@@ -34,6 +36,16 @@ class Scene(nn.Module):
     A hand is `canonical[side]`'s Gaussians under `hand_poses[side]`; with sharing on, both sides name the
     same canonical hand and the same shape.
     """
+
+    K: Tensor
+    surface_verts: Tensor | None
+    surface_faces: Tensor | None
+    # Modules' own containers, typed by what they hold.
+    hand_splats: MutableMapping[Side, HandSplats | HandDetail]
+    hand_poses: MutableMapping[Side, HandPoses]
+    grasps: MutableMapping[Side, Grasps]
+    betas: MutableMapping[Side, nn.Parameter]
+    object_splats: ObjectSplats | ObjectDetail | None
 
     def __init__(
         self,
@@ -61,11 +73,13 @@ class Scene(nn.Module):
         super().__init__()
         self.register_buffer("K", K, persistent=False)
         self.width, self.height = width, height
-        self.hand_splats = nn.ModuleDict(dict(hand_splats))
-        self.betas = nn.ParameterDict({side: nn.Parameter(value) for side, value in betas.items()})
+        self.hand_splats = nn.ModuleDict(hand_splats)  # type: ignore[assignment,arg-type]
+        self.betas = nn.ParameterDict(  # type: ignore[assignment]
+            {side: nn.Parameter(value) for side, value in betas.items()}
+        )
         self.base_betas = {side: value.clone() for side, value in betas.items()}
-        self.hand_poses = nn.ModuleDict(dict(hand_poses))
-        self.grasps = nn.ModuleDict(
+        self.hand_poses = nn.ModuleDict(hand_poses)  # type: ignore[assignment,arg-type]
+        self.grasps = nn.ModuleDict(  # type: ignore[assignment]
             {
                 side: Grasps(len(poses.base_orient), mirrored=side == "left")
                 for side, poses in hand_poses.items()

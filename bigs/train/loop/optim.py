@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from bigs.checks import InputError, expected_among
+from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import Scene
 
 _LIGHT = {"light": "clip", "shade": "shade"}
@@ -81,10 +82,11 @@ def _present(splats: Iterable[nn.Module], name: str) -> list[nn.Module | nn.Para
     return [getattr(one, name) for one in splats if hasattr(one, name)]
 
 
-def _pose_parameter(poses: nn.Module, name: str) -> nn.Parameter:
+def _pose_parameter(poses: HandPoses | ObjectPoses, name: str) -> nn.Parameter:
     if name in ("ray", "depth"):
         return poses.position.ray if name == "ray" else poses.position.log_depth
-    return getattr(poses, name)
+    parameter: nn.Parameter = getattr(poses, name)
+    return parameter
 
 
 def _parameters(owner: nn.Module | nn.Parameter) -> Iterable[nn.Parameter]:
