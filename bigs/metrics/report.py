@@ -65,19 +65,25 @@ METRICS: dict[str, Metric] = {
 _OF_ONE_FRAME = ("_icp", "_icp_sq", "_icp_arctic")
 
 
-def evaluate(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, float]:
+def evaluate(
+    pred: HandObjectTrajectory,
+    gt: HandObjectTrajectory,
+    of_frames: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, float]:
     """All scores of a clip; `METRICS` says what each key means and in which unit.
 
     Scores per frame are averaged over the frames that the truth has; `remarks` says so where it lacks some.
     What only one side has (a hand, the object) has no keys; `remarks` says which. CD_o, F5 and F10 are those
-    of the first frame that the truth has, as the evaluators have it.
+    of the first frame that the truth has, as the evaluators have it. `of_frames` is what `per_frame` gives
+    for the same two, where it is known already.
 
     Raises:
         InputError: the two list different frames, their arrays do not fit, a value of the prediction is not
             finite, or the truth of a frame is so in part.
     """
     pred = _matched(pred, gt)
-    scores = {key: _mean_of_finite(values) for key, values in _frame_scores(pred, gt).items()}
+    frames = _frame_scores(pred, gt) if of_frames is None else of_frames
+    scores = {key: _mean_of_finite(values) for key, values in frames.items()}
     scores["clip_scale"] = trajectory_scale(pred, gt)
     scores |= _aligned_object_scores(pred, gt)
     return {key: scores[key] for key in METRICS if key in scores}

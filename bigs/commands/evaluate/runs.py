@@ -125,13 +125,15 @@ def evaluate_run(
     else:
         listen(f"{run.name}: poses and shapes")
         truth = load_truth(truth_path, playback.frame_names, hand_models)
-        result |= evaluate(playback.trajectory(), truth)
-        told |= remarks_on(playback.trajectory(), truth)
+        found = playback.trajectory()
+        of_frames = per_frame(found, truth)
+        result |= evaluate(found, truth, of_frames)
+        told |= remarks_on(found, truth)
         if clip is not None and clip.hands and not clip.annotated:
             listen(f"{run.name}: initial estimates")
             initial = evaluate(initial_trajectory(clip, hand_models_of_run(run)), truth)
         order = match_frames(truth.frame_names, playback.frame_names)
-        frames |= {key: v[order] for key, v in per_frame(playback.trajectory(), truth).items()}
+        frames |= {key: v[order] for key, v in of_frames.items()}
     if clip is None:
         remarks.append("pictures are not scored: the run's clip was not found (--clip)")
     else:

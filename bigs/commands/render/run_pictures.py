@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> Non
     sheet = _sheet(clip, playback)
     save_picture(out / PREVIEW_PICTURE, sheet)
     kept: list[tuple[str, Image.Image]] = []
-    strips = _strips(clip, playback, kept)
+    strips = _ahead(_strips(clip, playback, kept))
     video: Path | None = out / PREVIEW_VIDEO
     try:
         write_video(out / PREVIEW_VIDEO, strips, FPS)
@@ -106,6 +107,15 @@ def _strips(clip: Clip, playback: Playback, kept: list[tuple[str, Image.Image]])
             small = Image.fromarray(strip).resize((width, height), Image.Resampling.LANCZOS)
             kept.append((f"frame {t} ({clip.frame_names[t]}): input, render, turned 40°", small))
         yield strip
+
+
+def _ahead(items: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """The same items, each made while the one before is used."""
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
 
 
 def _coverage(clip: Clip, playback: Playback) -> tuple[str, Image.Image] | None:

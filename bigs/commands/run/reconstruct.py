@@ -143,18 +143,17 @@ def reconstruct(
             watch.begin("scores")
             listen({"event": "note", "stage": "outputs", "text": "scoring"})
             frames = frame_scores(clip, playback)
-            scores["result"] = ({} if truth is None else evaluate(playback.trajectory(), truth)) | means(
-                frames
-            )
+            found = playback.trajectory()
+            of_frames = {} if truth is None else per_frame(found, truth)
+            scores["result"] = ({} if truth is None else evaluate(found, truth, of_frames)) | means(frames)
             for line in report.skipped:
                 log_and_listen({"event": "skipped", "text": line})
         write_json(out / METRICS, scores)
         told = partly(frames)
         if truth is not None:
-            told |= remarks(playback.trajectory(), truth)
+            told |= remarks(found, truth)
         table = comparison_table(scores, ALL_METRICS, told=told)
-        if truth is not None:
-            frames |= per_frame(playback.trajectory(), truth)
+        frames |= of_frames
         watch.begin("pictures")
         listen({"event": "note", "stage": "outputs", "text": "drawing pictures"})
 
