@@ -86,6 +86,9 @@ def silhouette_around_points(
     return silhouette_distance(allowed | (together >= _PATCH - 0.5))
 
 
+# Multiples of it, less their whole part, are never near to one another for long.
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+
 # This many points within reach of one another are no outliers.
 _PATCH = 4.0
 
@@ -116,12 +119,14 @@ class VisualHull:
         # The largest distances found so far, descending; the last one counts.
         largest = np.full((self.agreeing, len(points)), -np.inf)
         active = np.arange(len(points))
-        for silhouette, rotation, center in zip(self.silhouettes, self.rotations, self.centers, strict=True):
-            cam = points[active] @ rotation.T + center
+        # Neighbouring frames look from the same side, so that frames far apart settle more points sooner.
+        apart = np.argsort(np.arange(len(self.silhouettes)) * _GOLDEN % 1.0, kind="stable")
+        for t in apart:
+            cam = points[active] @ self.rotations[t].T + self.centers[t]
             u, v = self._pixels(cam)
             seen = (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
             pixels = scipy.ndimage.map_coordinates(
-                silhouette, np.stack([v[seen], u[seen]]), order=1, prefilter=False
+                self.silhouettes[t], np.stack([v[seen], u[seen]]), order=1, prefilter=False
             )
             index = active[seen]
             found = pixels * cam[seen, 2] / self.K[0, 0]

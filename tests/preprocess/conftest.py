@@ -4,15 +4,39 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from taken_apart import Given
+from torch import Tensor
 
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.hold import load_hold
+from bigs.preprocess.hands import tracks
+from bigs.preprocess.hands.fit import HandFit, HandFitConfig, fit_rays
+from bigs.preprocess.hands.skeleton import HandSkeleton
 from bigs.types import SIDES
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fitted_once() -> Iterator[None]:
+    """The same keypoints are fitted once, however many tests take a clip through all steps."""
+    known: dict[tuple[object, ...], HandFit] = {}
+
+    def fit(
+        skeleton: HandSkeleton, rays: Tensor, trust: Tensor, config: HandFitConfig, fps: float
+    ) -> HandFit:
+        arrays = (rays, trust, skeleton.rest_joints, skeleton.shape_moves)
+        key = (config, fps, *(array.numpy().tobytes() for array in arrays))
+        if key not in known:
+            known[key] = fit_rays(skeleton, rays, trust, config, fps)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracks, "fit_rays", fit)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.hand import HandModel
 from bigs.metrics.pose import mpjpe, wrist_error
+from bigs.preprocess.hands.fit import HandFitConfig
 from bigs.preprocess.hands.keypoints import Keypoints
 from bigs.preprocess.hands.sides import sort_sides
 from bigs.preprocess.hands.skeleton import HandSkeleton
@@ -24,6 +25,8 @@ FRAMES = 20
 GAP = slice(8, 10)
 SWAPPED = 4
 SEED = 3
+# A third of the usual steps.
+QUICK = HandFitConfig(candidates=4, candidate_steps=30, exchanges=1, steps=150)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +53,7 @@ def keypoints(joints: dict[Side, np.ndarray]) -> dict[Side, Keypoints]:
 
 @pytest.fixture(scope="module")
 def estimates(keypoints: dict[Side, Keypoints], both_hands: dict[Side, HandModel]) -> HandEstimates:
-    return fit_hands(keypoints, K, both_hands)
+    return fit_hands(keypoints, K, both_hands, config=QUICK)
 
 
 @pytest.mark.slow
@@ -98,7 +101,7 @@ def test_one_hand_alone(
     keypoints: dict[Side, Keypoints], joints: dict[Side, np.ndarray], both_hands: dict[Side, HandModel]
 ) -> None:
     left = Keypoints(keypoints["left"].points[6:16], keypoints["left"].confidence[6:16])
-    found = fit_hands({"left": left}, K, both_hands)
+    found = fit_hands({"left": left}, K, both_hands, config=QUICK)
     assert found.tracks.keys() == {"left"}
     assert mpjpe(pose_track(both_hands["left"], found.tracks["left"]), joints["left"][6:16]).mean() < 12.0
 
