@@ -276,7 +276,7 @@ SMOKE = replace(
     prior=PriorConfig(),
     hand=replace(FAST.hand, subdivisions=0, triplane=TriplaneConfig(features=4, resolution=32)),
     object=replace(FAST.object, n_gaussians=600, triplane=TriplaneConfig(features=4, resolution=32)),
-    initial=InitialConfig(surface_resolution=40),
+    initial=InitialConfig(surface_resolution=40, surface_smoothing=0.5),
     stages=(
         replace(_HANDS_COARSE, steps=25),
         replace(_HANDS_FINE, steps=10, image_size=80),
