@@ -182,7 +182,7 @@ def test_the_summary(clips: Clips, tmp_path: Path) -> None:
 
 
 def test_two_batches_do_not_share_a_folder(clips: Clips, tmp_path: Path) -> None:
-    with only_writer(tmp_path), pytest.raises(InputError, match="another process"):
+    with only_writer(tmp_path), pytest.raises(InputError, match="no other process works on"):
         work(plan_of(tmp_path, "a"))
     assert clips.calls == []
 
