@@ -137,11 +137,13 @@ def test_what_the_command_line_says(
 @pytest.mark.slow
 def test_a_real_row(tiny_clip: Path, tmp_path: Path) -> None:
     """A plan of two short stages, with its scores and times."""
-    stages = [replace(stage, steps=2) for stage in SMOKE.stages if stage.name in ("hands-coarse", "joint")]
+    stages = [
+        replace(stage, steps=2) for stage in SMOKE.stages if stage.name in ("hands-coarse", "appearance")
+    ]
     found = ablate(tiny_clip, tmp_path / "out", replace(SMOKE, stages=tuple(stages)), [])
     assert found.failed == []
     (row,) = json.loads((tmp_path / "out" / "ablation.json").read_text())["rows"]
     assert row["scores"]["result"]["mpjpe_ra_r"] > 0
-    assert list(row["times"]["stages"]) == ["start values", "hands-coarse", "joint", "outputs"]
-    assert row["times"]["stages"]["joint"]["phases"]["engine backward"] > 0
+    assert list(row["times"]["stages"]) == ["start values", "hands-coarse", "appearance", "outputs"]
+    assert row["times"]["stages"]["appearance"]["phases"]["engine backward"] > 0
     assert row["times"]["wall"] == pytest.approx(sum(s["wall"] for s in row["times"]["stages"].values()))
