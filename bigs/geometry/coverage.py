@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
+import torch
 
 # Surface that is turned away further than this is seen at a glancing angle only, cosine.
 _LEAST_COSINE = 0.2
@@ -58,10 +61,7 @@ def times_seen(
         surface: [M, 3] dense samples of the whole surface, which may hide the points.
         tolerance: metres that a point may lie behind the nearest surface of its pixel.
     """
-    count = np.zeros(len(points), dtype=int)
-    for t in range(len(views.shown)):
-        count += seen_in(views, t, points, normals, surface, tolerance)
-    return count
+    return _over_frames(views, points, lambda t: seen_in(views, t, points, normals, surface, tolerance))
 
 
 def seen_in(
@@ -88,13 +88,23 @@ def times_empty(views: ObjectViews, points: np.ndarray, surface: np.ndarray, tol
 
     `surface` holds samples that the clip has seen, metres; what is in front of them cannot be there.
     """
-    count = np.zeros(len(points), dtype=int)
-    for t in range(len(views.shown)):
+
+    def hiding(t: int) -> np.ndarray:
         row, column, depth, inside = views.pixels(t, points)
         # A surface that is seen from one side is unseen from the other; if only that side lies behind,
         # nothing is known.
         nearest = views.nearest_depths(t, surface)[row, column]
-        count += inside & views.shown[t, row, column] & np.isfinite(nearest) & (depth < nearest - tolerance)
+        return inside & views.shown[t, row, column] & np.isfinite(nearest) & (depth < nearest - tolerance)
+
+    return _over_frames(views, points, hiding)
+
+
+def _over_frames(views: ObjectViews, points: np.ndarray, holds: Callable[[int], np.ndarray]) -> np.ndarray:
+    """In how many frames [N] something holds of points [N, 3]; frames are looked at side by side."""
+    count = np.zeros(len(points), dtype=int)
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for of_frame in pool.map(holds, range(len(views.shown))):
+            count += of_frame
     return count
 
 
