@@ -25,7 +25,7 @@ def open_page(width: int = 720, height: int = 420) -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra 'browser'")
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if program is None:
-        pytest.skip("needs Chromium")
+        pytest.skip("no Chromium on the search path (chromium, chromium-browser or google-chrome)")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(_FLAGS))
         try:

@@ -31,16 +31,6 @@ _OUTER = torch.tensor(
     ],
     dtype=torch.float32,
 )
-# q @ _LEFT is the matrix, row by row, that multiplies like the quaternion q from the left.
-_LEFT = torch.tensor(
-    [
-        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
-        [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0],
-        [0, 0, -1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, -1, 0, 0],
-        [0, 0, 0, -1, 0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0],
-    ],
-    dtype=torch.float32,
-)
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
@@ -84,11 +74,6 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         dim=-1,
     )
-
-
-def left_products(quats: Tensor) -> Tensor:
-    """Matrices [..., 4, 4] that multiply like the quaternions [..., 4] from the left."""
-    return (quats @ _LEFT.to(quats)).unflatten(-1, (4, 4))
 
 
 def rot6d_to_matrix(rot6d: Tensor) -> Tensor:
