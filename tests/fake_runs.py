@@ -8,6 +8,7 @@ from typing import Any
 
 from bigs.commands.folder.contents import CHECKPOINTS, CONFIG, LOG, METRICS, write_json
 from bigs.commands.run.reconstruct import run_origin
+from bigs.train.fit import Observer
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import save_config
 from bigs.train.resolve import resolve
@@ -48,6 +49,7 @@ class FakeRuns:
         ground_truth: Path | None,
         resume: bool,
         listen: Callable[[Mapping[str, Any]], None],
+        observe: Observer | None,
     ) -> None:
         assert resume == (out / CONFIG).exists()
         self.made.append(out.name)

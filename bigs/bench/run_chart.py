@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from io import BytesIO
-from typing import Any
+from typing import Any, Literal
 
 from bigs.bench.chart import check_drawing
 from bigs.bench.run_tables import finished, is_timed, mean, score
@@ -18,14 +18,22 @@ _PANELS = (
     ("100 - F10 in the scaled clip, %", "f10_cam", True),
     ("PSNR of the foreground, dB", "psnr_foreground", False),
 )
+# Which seconds of a run to draw.
+Clock = Literal["wall", "cpu"]
+_SECONDS: dict[Clock, str] = {"wall": "wall time of a run, s", "cpu": "CPU time of a run, all threads, s"}
 _COLORS = ("#1b6ca8", "#c8553d", "#5b8c5a", "#8e6c8a", "#b8860b", "#3f3f3f", "#d081a6", "#5f9ea0")
 
 
-def draw_runs(report: dict[str, Any]) -> bytes:
-    """A PNG with a panel for each error: a small point for each clip, a large one for the mean.
+def draw_runs(report: dict[str, Any], clock: Clock = "wall") -> bytes:
+    """A PNG with a panel for each error: a line along each run, and a large mark for the mean result.
 
-    Presets are round, presets without something are crosses, and runs of fewer steps than planned are hollow.
-    Dashes mark the initial estimates.
+    A dot on a line is the end of a stage. A line ends before the mark, which includes writing and scoring the
+    outputs. Presets are round, presets without something are crosses, and runs of fewer steps than planned
+    are hollow. Dashes mark the initial estimates.
+
+    Args:
+        report: what the command measured.
+        clock: the seconds of the horizontal axis.
     """
     figure_module, ticker = check_drawing("--picture"), importlib.import_module("matplotlib.ticker")
     figure = figure_module.Figure(figsize=(10.5, 6.4), dpi=100, layout="constrained")
@@ -45,9 +53,9 @@ def draw_runs(report: dict[str, Any]) -> bytes:
         if start is not None:
             axis.axhline(start, color="#888888", linestyle="--", linewidth=0.8, label="initial estimates")
         for index, (label, group) in enumerate(runs.items()):
-            _draw_runs(axis, label, group, key, inverted, _COLORS[index % len(_COLORS)])
+            _draw_group(axis, label, group, key, inverted, _COLORS[index % len(_COLORS)], clock)
     for axis in axes[3:]:
-        axis.set_xlabel("wall time of a run, s", fontsize=8)
+        axis.set_xlabel(_SECONDS[clock], fontsize=8)
     # Any panel may lack a score, so the legend collects from all.
     named = {
         label: handle
@@ -62,13 +70,16 @@ def draw_runs(report: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _draw_runs(
-    axis: Any, label: str, group: list[dict[str, Any]], key: str, inverted: bool, color: str
+def _draw_group(
+    axis: Any, label: str, group: list[dict[str, Any]], key: str, inverted: bool, color: str, clock: Clock
 ) -> None:
+    timed = [run for run in group if is_timed(run)]
+    for run in timed:
+        _draw_line(axis, run, key, inverted, color, clock)
     points = [
-        (run["times"]["wall"], value)
-        for run in group
-        if is_timed(run) and (value := _shown(run["scores"]["result"], key, inverted)) is not None
+        (run["times"][clock], value)
+        for run in timed
+        if (value := _shown(run["scores"]["result"], key, inverted)) is not None
     ]
     if not points:
         return
@@ -76,9 +87,22 @@ def _draw_runs(
     face = "none" if group[0]["planned"] != group[0]["steps"] else color
     style = {"color": color, "markerfacecolor": face, "linestyle": "none"}
     if len(points) > 1:
-        axis.plot(*zip(*points, strict=True), marker, markersize=3, alpha=0.6, **style)
+        axis.plot(*zip(*points, strict=True), marker, markersize=4, alpha=0.6, **style)
     middle = [mean(values) for values in zip(*points, strict=True)]
     axis.plot([middle[0]], [middle[1]], marker, markersize=8, label=label, **style)
+
+
+def _draw_line(axis: Any, run: dict[str, Any], key: str, inverted: bool, color: str, clock: Clock) -> None:
+    known = [
+        (point[clock], value, point["step"] is None)
+        for point in run["curve"]
+        if (value := _shown(point["scores"], key, inverted)) is not None
+    ]
+    if not known:
+        return
+    seconds, values, ends = zip(*known, strict=True)
+    dots = [index for index, end in enumerate(ends) if end]
+    axis.plot(seconds, values, "-o", markevery=dots, markersize=2, linewidth=1.0, alpha=0.8, color=color)
 
 
 def _shown(scores: dict[str, float], key: str, inverted: bool) -> float | None:

@@ -48,7 +48,7 @@ BRIEF = ("Time and errors", "Switches", "Failed or not timed")
 def tables_of_runs(report: dict[str, Any]) -> list[Table]:
     """All tables for which there are measurements."""
     made = [_means(report), _clips(report), _stages(report), _phases(report), _switches(report)]
-    made += [_skips(report), _growth(report), _failures(report)]
+    made += [_along(report), _skips(report), _growth(report), _failures(report)]
     return [table for table in made if len(table.rows) > 1]
 
 
@@ -187,6 +187,29 @@ def _stages(report: dict[str, Any]) -> Table:
             rows.append((label, name, f"{stage['wall']:.2f}", f"{stage['cpu']:.2f}", steps, per_step))
     note = "Means over clips. 'outputs' is files, scores, pictures and the report."
     return Table("Stages", note, rows)
+
+
+def _along(report: dict[str, Any]) -> Table:
+    rows: Rows = [("run", "clip", "stage", "CPU s", "wall s", *_HEADINGS)]
+    for label, runs in finished(report).items():
+        for run in runs:
+            rows += [
+                (
+                    label,
+                    run["clip"],
+                    point["stage"],
+                    f"{point['cpu']:.1f}",
+                    f"{point['wall']:.1f}",
+                    *_score_cells([point["scores"]]),
+                )
+                for point in run["curve"]
+                if point["step"] is None and is_timed(run)
+            ]
+    note = (
+        "Scores at the end of each stage, over at most 20 frames of the clip, and the seconds that the run "
+        "had taken by then, without scoring. reconstruct.json has the points between, too."
+    )
+    return Table("Along the runs", note, rows)
 
 
 def _phases(report: dict[str, Any]) -> Table:

@@ -65,6 +65,8 @@ def bench_reconstruct(
     without: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     steps_limit: int = 0,
     hand_model: Path | None = None,
+    curve_every: float = 10.0,
+    clock: Literal["wall", "cpu"] = "wall",
     frames: tuple[int, ...] = (15, 30, 60),
     growth_steps: int = 6,
     picture: bool = True,
@@ -80,6 +82,9 @@ def bench_reconstruct(
             by +); repeatable.
         steps_limit: presets with more steps are cut to about this many, and say so; 0 runs all.
         hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        curve_every: CPU seconds between the points at which a run is scored within its stages; 0 scores the
+            ends of stages only.
+        clock: seconds of the picture; cpu counts all threads and is steadier where other work runs.
         frames: numbers of frames at which to measure how the cost grows.
         growth_steps: steps of each stage for that; 0 skips it.
         picture: draw the picture, which needs matplotlib.
@@ -90,7 +95,7 @@ def bench_reconstruct(
     from bigs.commands.bench.reconstruct import RunPlan
     from bigs.commands.bench.reconstruct import bench_reconstruct as run
 
-    plan = RunPlan(clips, presets, without, steps_limit, hand_model, frames, growth_steps)
+    plan = RunPlan(clips, presets, without, steps_limit, hand_model, curve_every, clock, frames, growth_steps)
     with telling() as tell:
         found = run(plan, out, picture=picture, listen=tell)
     print_tables([table for table in found.tables if table.title in BRIEF], out)

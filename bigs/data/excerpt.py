@@ -1,12 +1,14 @@
-"""A clip of other frames than it has: fewer, or more of them by going to and fro."""
+"""A clip, or a trajectory, of other frames than it has: fewer, or more by going to and fro."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.types import HandObjectTrajectory
 
 
 def to_and_fro(available: int, count: int) -> np.ndarray:
@@ -48,4 +50,23 @@ def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
         object=obj,
         optics=None if clip.optics is None else clip.optics.chosen(frames),
         mask_areas={entity: areas[frames] for entity, areas in clip.mask_areas.items()},
+    )
+
+
+def excerpt_trajectory(
+    trajectory: HandObjectTrajectory, frames: Sequence[int] | np.ndarray
+) -> HandObjectTrajectory:
+    """The trajectory of the given frames only, in that order.
+
+    Args:
+        trajectory: the trajectory.
+        frames: [T'] indices of its frames.
+    """
+    verts = trajectory.object_verts
+    return replace(
+        trajectory,
+        frame_names=tuple(trajectory.frame_names[t] for t in frames),
+        joints={side: joints[frames] for side, joints in trajectory.joints.items()},
+        verts={side: verts[frames] for side, verts in trajectory.verts.items()},
+        object_verts=None if verts is None else verts[frames],
     )

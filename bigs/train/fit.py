@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -59,8 +59,17 @@ class FitReport:
     before: float = 0.0
 
 
+class Waypoint(NamedTuple):
+    """How far a run has come."""
+
+    stage: str  # of the plan, or "start values"
+    step: int | None  # steps of the stage done; None at its end
+
+
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
 Listener = Callable[[dict[str, Any]], None]
+# Looks at the scene after the start values, every step and every stage, and leaves it as it is.
+Observer = Callable[[Scene, Waypoint], None]
 
 
 def fit(
@@ -74,6 +83,7 @@ def fit(
     resume: bool = False,
     listen: Listener = lambda event: None,
     watch: Stopwatch | None = None,
+    observe: Observer | None = None,
 ) -> tuple[Scene, FitReport]:
     """Fit a scene to a clip.
 
@@ -86,7 +96,8 @@ def fit(
         checkpoints: folder for checkpoints; None keeps none.
         resume: continue from the checkpoint there, if there is one.
         listen: told of stages, steps and notes as they happen.
-        watch: goes on through the stages; a new one if not given.
+        watch: goes on through the stages; a new one if not given. It stands still while `observe` looks.
+        observe: sees the scene along the way.
 
     Raises:
         InputError: the configuration names unknown groups or terms or needs a network that is not given, or
@@ -136,6 +147,18 @@ def fit(
         if checkpoints:
             save_checkpoint(checkpoints, scene, digest, index, state, asdict(report))
 
+    def show(stage: str, step: int | None) -> None:
+        if observe is not None:
+            with watch.paused():
+                observe(scene, Waypoint(stage, step))
+
+    def listen_and_show(event: dict[str, Any]) -> None:
+        listen(event)
+        if event["event"] == "step":
+            show(event["stage"], event["step"])
+
+    if position is None:
+        show("start values", None)
     for index, stage in enumerate(config.stages):
         if index < first or isinstance(stage, ObjectMotionStage):
             continue
@@ -165,12 +188,14 @@ def fit(
                 done = run_completion(scene, stage, sources, config, start.symmetries)
                 report.completed = done.skipped is None
             else:
-                done = run_guidance(scene, stage, index, sources, config, denoiser, continues, keep, listen)
+                done = run_guidance(
+                    scene, stage, index, sources, config, denoiser, continues, keep, listen_and_show
+                )
             if done.skipped:
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
         else:
-            last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen)
+            last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen_and_show)
             if last.step < stage.steps:
                 report.skipped.append(
                     f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had converged"
@@ -179,6 +204,7 @@ def fit(
                 now = len(scene.object_splats.base_points)
                 report.facts["object Gaussians"] = f"{gaussians} at the start, {now} after {stage.name}"
         keep(index + 1, None)
+        show(stage.name, None)
     report.seconds = watch.read()
     scene.requires_grad_(False)
     if start.known and not report.completed:

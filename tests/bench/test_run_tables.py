@@ -45,6 +45,10 @@ def run(clip: str, label: str, error: float, stages: dict[str, Any], **more: Any
         },
         "times": {"wall": wall, "cpu": 2 * wall, "resumed": False, "stages": stages},
         "skipped": [],
+        "curve": [
+            {"stage": name, "step": step, "wall": at, "cpu": 2 * at, "scores": {"mpjpe_ra_h": 20.0 - at}}
+            for name, step, at in (("hands", 5, 0.5), ("hands", None, 1.0), ("joint", None, 3.0))
+        ],
         "failure": "",
         "reused": False,
         **more,
@@ -122,6 +126,16 @@ def test_where_the_time_goes(report: dict[str, Any]) -> None:
     assert second == ("fast", "joint", "50.0", "50.0", "200.0", "300.0")
 
 
+def test_scores_along_a_run(report: dict[str, Any]) -> None:
+    """The ends of stages; a run without times has none."""
+    report["runs"][1]["times"]["resumed"] = True
+    _, *rows = by_title(report)["Along the runs"]
+    assert [row[:6] for row in rows if row[0] == "fast"] == [
+        ("fast", "a", "hands", "2.0", "1.0", "19.00"),
+        ("fast", "a", "joint", "6.0", "3.0", "17.00"),
+    ]
+
+
 def test_what_was_saved(report: dict[str, Any]) -> None:
     rows = by_title(report)["Work left out"]
     assert ("fast", "a", "fields in 10 steps of hands, at the 50.0 ms of joint", "0.5") in rows
@@ -187,5 +201,10 @@ def test_the_picture(report: dict[str, Any]) -> None:
     pytest.importorskip("matplotlib")
     full = draw_runs(report)
     assert full.startswith(b"\x89PNG") and len(full) < 200_000
+    assert draw_runs(report, "cpu") != full
+    lines = [run["curve"] for run in report["runs"]]
+    for run in report["runs"]:
+        run["curve"] = []
+    assert len(draw_runs(report)) < len(full) and all(lines)
     report["runs"] = []
     assert len(draw_runs(report)) < len(full)

@@ -15,7 +15,7 @@ from bigs.atomic import atomic_write
 from bigs.bench.chart import check_drawing
 from bigs.bench.machine import machine_facts
 from bigs.bench.page import Table, page
-from bigs.bench.run_chart import draw_runs
+from bigs.bench.run_chart import Clock, draw_runs
 from bigs.bench.run_tables import introduction, tables_of_runs
 from bigs.checks import InputError, check_choice
 from bigs.commands.bench.growth import measure, probes
@@ -50,6 +50,10 @@ class RunPlan:
     # Presets with more steps are cut to about this many; 0 runs all.
     steps_limit: int = 0
     hand_model: Path | None = None
+    # CPU seconds between the points of a run's curve; 0 has the ends of stages only.
+    curve_every: float = 10.0
+    # The seconds of the picture.
+    clock: Clock = "wall"
     # Growth of the first preset on the first clip: numbers of frames, and steps of each stage (0: none).
     frames: tuple[int, ...] = (15, 30, 60)
     growth_steps: int = 6
@@ -135,8 +139,12 @@ def bench_reconstruct(
     names = clip_names(plan.clips)
     if not plan.presets:
         raise InputError("--presets: expected at least one, found none")
-    for option, value in (("--steps-limit", plan.steps_limit), ("--growth-steps", plan.growth_steps)):
-        if value < 0:
+    for option, value in (
+        ("--steps-limit", plan.steps_limit),
+        ("--growth-steps", plan.growth_steps),
+        ("--curve-every", plan.curve_every),
+    ):
+        if not value >= 0:
             raise InputError(f"{option}: expected 0 or more, found {value}")
     if any(count < 2 for count in plan.frames):
         raise InputError(f"--frames: expected numbers of at least 2, found {min(plan.frames)}")
@@ -152,7 +160,8 @@ def bench_reconstruct(
         if truth is not None:
             load_ground_truth(truth)
         for variant in chosen:
-            run = PlannedRun(out / name / variant.folder, path, variant.config, plan.hand_model, truth)
+            folder = out / name / variant.folder
+            run = PlannedRun(folder, path, variant.config, plan.hand_model, truth, plan.curve_every)
             planned.append((name, variant, run))
     check_folders([run for _, _, run in planned])
 
@@ -188,7 +197,7 @@ def bench_reconstruct(
         tables = _write(out, report)
         if picture and not (done.reused and (out / PICTURE).exists() and run is not planned[-1][-1]):
             with atomic_write(out / PICTURE) as file:
-                file.write(draw_runs(report))
+                file.write(draw_runs(report, plan.clock))
     if plan.growth_steps:
         report["growth_of"] = {"clip": names[0], "label": plan.presets[0], "steps": plan.growth_steps}
         for probe in probes(clips[names[0]], PRESETS[plan.presets[0]], plan.frames):

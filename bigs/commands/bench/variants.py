@@ -14,7 +14,7 @@ from PIL import Image
 
 from bigs.commands.bench.clip_damage import as_jpeg
 from bigs.data.base import Clip
-from bigs.data.excerpt import to_and_fro
+from bigs.data.excerpt import excerpt_trajectory, to_and_fro
 from bigs.data.limited_view import limited_frames, object_directions
 from bigs.types import MASK_VALUES, SIDES, HandObjectTrajectory, Side
 
@@ -130,14 +130,8 @@ def write_variant(
 
 def truth_of(truth: HandObjectTrajectory, given: Given) -> HandObjectTrajectory:
     """The truth of the frames that a variant shows, named as its pictures are."""
-    at = given.frames
-    return replace(
-        truth,
-        frame_names=tuple(f"{i:04d}" for i in range(len(at))),
-        joints={side: joints[at] for side, joints in truth.joints.items()},
-        verts={side: verts[at] for side, verts in truth.verts.items()},
-        object_verts=None if truth.object_verts is None else truth.object_verts[at],
-    )
+    names = tuple(f"{i:04d}" for i in range(len(given.frames)))
+    return replace(excerpt_trajectory(truth, given.frames), frame_names=names)
 
 
 def simulated_keypoints(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError, found_at
 from bigs.data.annotation import Annotation
 from bigs.data.arctic import find_arctic, read_arctic
+from bigs.data.excerpt import excerpt_trajectory
 from bigs.data.ground_truth import load_ground_truth
 from bigs.data.ho3d import find_ho3d, read_ho3d
 from bigs.hand import HandModel
@@ -48,13 +48,7 @@ def _frames_of(truth: HandObjectTrajectory, frame_names: Sequence[str]) -> HandO
     kept = [t for t, name in enumerate(truth.frame_names) if PurePath(name).stem in wanted]
     if not kept or len(kept) != len(frame_names) or len(kept) == len(truth.frame_names):
         return truth
-    return replace(
-        truth,
-        frame_names=tuple(truth.frame_names[t] for t in kept),
-        joints={side: joints[kept] for side, joints in truth.joints.items()},
-        verts={side: verts[kept] for side, verts in truth.verts.items()},
-        object_verts=None if truth.object_verts is None else truth.object_verts[kept],
-    )
+    return excerpt_trajectory(truth, kept)
 
 
 def is_own_truth(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,23 @@ from bigs.models.playback import Playback
 from bigs.types import MASK_VALUES
 
 
-def frame_scores(clip: Clip, playback: Playback, distance: Distance | None = None) -> dict[str, np.ndarray]:
-    """Image scores of every frame of the clip, by key, [T]; NaN where the mask is empty."""
+def frame_scores(
+    clip: Clip,
+    playback: Playback,
+    distance: Distance | None = None,
+    at: Sequence[int] | np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
+    """Image scores of every frame of the clip, by key, [T]; NaN where the mask is empty.
+
+    Args:
+        clip: the clip, or some of its frames.
+        playback: the reconstruction.
+        distance: see `picture_scores`.
+        at: [T] the playback's frames that show the clip's; None takes all in their order.
+    """
     rows = []
-    for t in range(len(clip)):
-        color, _ = render_input_view(playback, t)
+    for t, frame in enumerate(range(len(clip)) if at is None else at):
+        color, _ = render_input_view(playback, int(frame))
         rows.append(picture_scores(color, clip.image(t) / 255.0, clip.mask(t) != 0, distance))
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 

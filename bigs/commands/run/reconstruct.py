@@ -35,7 +35,7 @@ from bigs.metrics.picture import ALL_METRICS
 from bigs.metrics.report import comparison_table, evaluate, per_frame, remarks
 from bigs.models.playback import record
 from bigs.train.check_plan import check_plan
-from bigs.train.fit import FitReport, fit
+from bigs.train.fit import FitReport, Observer, fit
 from bigs.train.loop.checkpoint import FILE_NAME
 from bigs.train.loop.stopwatch import Stopwatch
 from bigs.train.plan.config import RunConfig
@@ -65,6 +65,7 @@ def reconstruct(
     resume: bool = False,
     listen: Callable[[dict[str, Any]], None] = lambda event: None,
     watch: Stopwatch | None = None,
+    observe: Observer | None = None,
 ) -> Outcome:
     """Reconstruct a clip into a run folder.
 
@@ -80,6 +81,7 @@ def reconstruct(
         resume: continue an interrupted run.
         listen: told of stages, steps and notes, for progress displays.
         watch: goes on from what the caller did before; a new one if not given.
+        observe: sees the scene along the way; see `fit`.
 
     Raises:
         InputError: bad input, in one sentence.
@@ -132,6 +134,7 @@ def reconstruct(
                 resume=resume,
                 listen=log_and_listen,
                 watch=watch,
+                observe=observe,
             )
             report.skipped[:0] = resolved.notes
             watch.begin("results")

@@ -8,17 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from bigs.checks import InputError
+from bigs.commands.clips.open import open_estimates
+from bigs.commands.clips.truth import load_truth
 from bigs.commands.folder.contents import CHECKPOINTS, CONFIG, LOG, METRICS, read_scores, write_json
 from bigs.commands.folder.log import read_log
+from bigs.commands.run.curve import Curve
 from bigs.commands.run.reconstruct import reconstruct, run_origin
 from bigs.files import read_json, read_yaml
-from bigs.train.loop.profile import profiled
+from bigs.hand import load_hand_models
+from bigs.train.loop.profile import Profile, profiled
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import load_config
 from bigs.train.resolve import resolve
 
 # Written last, so a folder that has it holds a finished run of a series.
 TIMES = "times.json"
+CURVE = "curve.json"
 
 # Receives a short text on what is being done.
 Listener = Callable[[str], None]
@@ -33,6 +38,8 @@ class PlannedRun:
     config: RunConfig
     hand_model: Path | None
     ground_truth: Path | None
+    # CPU seconds between the points of its curve (see `Curve`); None keeps no curve.
+    curve: float | None = None
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,8 @@ class FinishedRun:
     scores: dict[str, dict[str, float]] = field(default_factory=dict)  # "initial" and "result"
     times: dict[str, Any] = field(default_factory=dict)  # seconds; see `run_or_reuse`
     skipped: list[str] = field(default_factory=list)
+    # Scores along the run, with the stage, its steps, and wall and CPU seconds until then.
+    curve: list[dict[str, Any]] = field(default_factory=list)
     failure: str = ""  # why there is no result
     reused: bool = False  # it was finished before
 
@@ -81,7 +90,8 @@ def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> Finis
             _run(run, listen)
         scores = read_scores(run.folder)
         skipped = [row["text"] for row in read_log(run.folder / LOG) if row["event"] == "skipped"]
-        return FinishedRun(scores, _read(run.folder / TIMES), skipped, reused=reused)
+        curve = _read(run.folder / CURVE)["points"] if (run.folder / CURVE).exists() else []
+        return FinishedRun(scores, _read(run.folder / TIMES), skipped, curve, reused=reused)
     # A failed run gets a row with the reason; the others go on.
     except Exception as error:
         return FinishedRun(failure=f"{type(error).__name__}: {error}")
@@ -90,6 +100,8 @@ def run_or_reuse(run: PlannedRun, listen: Listener = lambda text: None) -> Finis
 def _run(run: PlannedRun, listen: Listener) -> None:
     resumed = (run.folder / CHECKPOINTS).exists()
     with profiled() as profile:
+        with profile.paused():
+            curve = _curve(run, profile)
 
         def follow(event: dict[str, Any]) -> None:
             profile.listen(event)
@@ -105,6 +117,7 @@ def _run(run: PlannedRun, listen: Listener) -> None:
             ground_truth=run.ground_truth,
             resume=(run.folder / CONFIG).exists(),
             listen=follow,
+            observe=curve,
         )
     stages = {
         name: {
@@ -126,6 +139,15 @@ def _run(run: PlannedRun, listen: Listener) -> None:
             "stages": stages,
         },
     )
+
+
+def _curve(run: PlannedRun, profile: Profile) -> Curve | None:
+    if run.curve is None:
+        return None
+    hand_models = load_hand_models(run.hand_model)
+    clip = open_estimates(run.clip, hand_models)
+    truth = None if run.ground_truth is None else load_truth(run.ground_truth, clip.frame_names, hand_models)
+    return Curve(clip, truth, profile, run.curve, run.folder / CURVE)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -82,6 +82,22 @@ class Profile:
         self._current.cpu += now[1] - self._began[1]
         self._began = now
 
+    def spent(self) -> tuple[float, float]:
+        """Wall and CPU seconds of all stages until now."""
+        self.finish()
+        return sum(s.wall for s in self.stages.values()), sum(s.cpu for s in self.stages.values())
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """What happens inside belongs to no stage; not within a phase."""
+        self.finish()
+        running, self._current = self._current, StageTimes()
+        try:
+            yield
+        finally:
+            self.finish()
+            self._current = running
+
     def _charge(self) -> None:
         now = time.perf_counter()
         if self._open:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Seconds by part. Every instant since its creation belongs to exactly one part.
+    """Seconds by part. Every instant since its creation belongs to exactly one part, unless it is `paused`.
 
     Args:
         first: what begins now.
@@ -30,6 +31,15 @@ class Stopwatch:
         self._seconds[self._current] += now - self._since
         self._since = now
         return dict(self._seconds)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """What happens inside belongs to no part."""
+        self.read()
+        try:
+            yield
+        finally:
+            self._since = time.perf_counter()
 
     def add(self, earlier: Mapping[str, float]) -> None:
         """Count what an earlier, interrupted run took; its parts come first."""

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import Answer, assert_refused
+from command_line import Answer, Run, assert_refused
 from fake_runs import FakeRuns, idle_switch
 
 from bigs.checks import InputError
 from bigs.commands.bench.growth import Probe, measure, probes
 from bigs.commands.bench.reconstruct import RunPlan, bench_reconstruct, variants
-from bigs.commands.folder.contents import CONFIG
+from bigs.commands.folder.contents import CONFIG, SCENE
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.train.plan.config import OptimizeStage
@@ -75,6 +75,35 @@ def test_a_probe(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
     assert found["gaussians"] >= 2 * 778 + 600
     milliseconds = sum(planned_steps(config)[name] * ms for name, ms in found["stages"].items())
     assert found["total"] == pytest.approx(found["start"] + found["searches"]["grasps"] + 1e-3 * milliseconds)
+
+
+@pytest.mark.slow
+def test_a_curve(finished_run: Run, tiny_clip: Path, tmp_path: Path) -> None:
+    """Scores along the run, whose result is that of a run that nothing watches."""
+    plan = RunPlan((tiny_clip,), ("smoke",), curve_every=0.2, growth_steps=0)
+    assert bench_reconstruct(plan, tmp_path, picture=False).failed == []
+    (run,) = json.loads((tmp_path / "reconstruct.json").read_text())["runs"]
+    points, times = run["curve"], run["times"]
+    scene = (tmp_path / "clip" / "smoke" / SCENE).read_bytes()
+    assert scene == (finished_run.folder / SCENE).read_bytes()
+
+    ends = [point["stage"] for point in points if point["step"] is None]
+    assert ends == [name for name in times["stages"] if name != "outputs"]
+    within = [point for point in points if point["step"] is not None]
+    assert len(within) >= 3
+    assert all(0 < point["step"] <= times["stages"][point["stage"]]["steps"] for point in within)
+    for clock in ("wall", "cpu"):
+        seconds = [point[clock] for point in points]
+        assert seconds == sorted(seconds) and seconds[0] > 0.0 and seconds[-1] < times[clock]
+    # What took longer than the whole run did is not part of it.
+    assert sum(stage["in_steps"] for stage in times["stages"].values()) < points[-1]["wall"]
+    keys = {"mpjpe_ra_h", "wrist_h", "cd_h_sq", "cd_icp_sq", "f5_icp", "psnr_foreground"}
+    assert all(keys <= set(point["scores"]) for point in points)
+    # All frames of so short a clip are scored, as they are in the end.
+    last, result = points[-1]["scores"], run["scores"]["result"]
+    assert last["mpjpe_ra_h"] == pytest.approx(result["mpjpe_ra_h"])
+    assert last["psnr_foreground"] == pytest.approx(result["psnr_foreground"])
+    assert last["mpjpe_ra_h"] < points[0]["scores"]["mpjpe_ra_h"]
 
 
 @pytest.fixture
@@ -147,6 +176,7 @@ def test_what_the_command_line_says(
         ("CLIP --presets smoke --without blur", ["--without", "share", "found 'blur'"]),
         ("CLIP --presets smoke --steps-limit -1", ["--steps-limit", "found -1"]),
         ("CLIP --presets smoke --growth-steps -1", ["--growth-steps", "found -1"]),
+        ("CLIP --presets smoke --curve-every -2", ["--curve-every", "found -2"]),
         ("CLIP --presets smoke --frames 1", ["--frames", "at least 2", "found 1"]),
         ("CLIP --presets", ["--presets"]),
         ("NOWHERE --presets smoke", ["nowhere", "expected a clip"]),

@@ -93,6 +93,21 @@ def test_a_stage_lasts_until_the_next(clock: Clock) -> None:
     assert (one.steps, one.in_steps, one.cpu, one.rest) == (2, 5.0, 12.0, 6.0)
 
 
+def test_a_pause_counts_nowhere(clock: Clock) -> None:
+    profile = Profile()
+    profile.begin("a")
+    clock.now += 2.0
+    with profile.paused(), profile.phase("engine"):
+        clock.now += 100.0
+    clock.now += 1.0
+    wall, cpu = profile.spent()
+    profile.begin("b")
+    stage = profile.stages["a"]
+    assert (stage.wall, stage.cpu, stage.phases["engine"]) == (3.0, 6.0, 0.0)
+    # What was before the first stage was begun counts, as it does in a run.
+    assert list(profile.stages) == ["a", "b"] and (wall, cpu) == (3.0, 6.0)
+
+
 def test_a_run_in_a_profile(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
     config = short(PRESETS["smoke"], "hands-coarse", "joint")
     before = (PosedScene.posed, Scene.canonical, dict(terms.TERMS), torch.Tensor.backward, step.rasterization)

@@ -42,3 +42,12 @@ def test_an_interrupted_run_counts_with_its_parts_first(clock: list[float]) -> N
     total = watch.read()
     assert total == {"loading": 6.0, "start values": 4.0, "coarse": 17.0, "results": 1.0}
     assert list(total) == ["loading", "start values", "coarse", "results"]
+
+
+def test_a_pause_belongs_to_no_part(clock: list[float]) -> None:
+    watch = Stopwatch("loading")
+    clock[0] += 2.0
+    with watch.paused():
+        clock[0] += 100.0
+    clock[0] += 1.0
+    assert watch.read() == {"loading": 3.0}
