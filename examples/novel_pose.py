@@ -37,13 +37,8 @@ from bigs.hand import HandModel, load_hand_models, mirror_points
 from bigs.models.playback import HandPlayback, Playback
 from bigs.models.repose import repose
 from bigs.train.plan.presets import PRESETS
-from bigs.train.start.initial import (
-    InitialConfig,
-    hand_in_camera,
-    object_in_camera,
-    smooth_hand,
-    smooth_object,
-)
+from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.initial import hand_in_camera, object_in_camera, smooth_hand, smooth_object
 from bigs.types import Side
 
 SHOWN = 5

@@ -75,6 +75,16 @@ MAY_IMPORT["bench"] = BELOW | {"bigs", "raster", "_raster"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT) - {"_raster"}
 MAY_IMPORT["cli"] = {"bigs", "types", "checks", "commands", "train", "bench", "preprocess"}
 
+# The same within `train`: a folder may import itself and what its entry names. The modules beside the folders
+# put them together and may import all of them.
+ROOMS: dict[str, set[str]] = {
+    "plan": set(),
+    "start": {"plan"},
+    "grasps": {"plan"},
+    "loop": {"plan", "start", "grasps"},
+    "unseen": {"plan", "start", "loop"},
+}
+
 # Single edges that the table does not allow: the importing module, what it imports.
 EXCEPTIONS = {("losses.photometric", "metrics.image")}  # so that SSIM exists once
 
@@ -140,6 +150,16 @@ def offence(found: Import) -> str | None:
     return f"{found.place}: bigs.{found.module} imports {found.target}, but {part} may not see {other}"
 
 
+def offence_in_train(found: Import) -> str | None:
+    """One line that names an edge between folders of `train` that does not point down, or None."""
+    module, target = found.module.split("."), found.target.split(".")
+    if module[0] != "train" or target[0] != "train" or len(module) < 2 or module[1] not in ROOMS:
+        return None
+    if len(target) > 1 and target[1] in ROOMS[module[1]] | {module[1]}:
+        return None
+    return f"{found.place}: bigs.{found.module} imports {found.target}, which train.{module[1]} may not see"
+
+
 def test_every_part_is_in_the_table() -> None:
     parts = {name_of(path).split(".")[0] for path in sources()}
     assert parts == set(MAY_IMPORT), f"not in both: {sorted(parts ^ set(MAY_IMPORT))}"
@@ -158,6 +178,25 @@ def test_the_table_has_no_cycles() -> None:
 def test_imports_only_point_down() -> None:
     offences = [line for found in all_imports() if (line := offence(found))]
     assert not offences, "\n" + "\n".join(offences)
+
+
+def test_folders_of_train_only_point_down() -> None:
+    assert set(ROOMS) == {path.parent.name for path in (ROOT / "train").glob("*/__init__.py")}
+    offences = [line for found in all_imports() if (line := offence_in_train(found))]
+    assert not offences, "\n" + "\n".join(offences)
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("train/plan/config.py", "from bigs.train.loop.density import Pull"),
+        ("train/start/build.py", "from bigs.train.fit import fit"),
+        ("train/loop/step.py", "import bigs.train.unseen.stages"),
+    ],
+)
+def test_forbidden_edges_within_train_are_found(module: str, line: str) -> None:
+    (found,) = imports_of(ROOT / module, ast.parse(line))
+    assert offence_in_train(found) is not None
 
 
 def test_exceptions_are_still_needed() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 from bigs.checks import InputError, check_choice
-from bigs.train.loop.density import DensifyConfig
 from bigs.train.loop.optim import GROUPS, ONLY_FREE, ONLY_IN_FIELDS
 from bigs.train.loop.terms import terms_of
 from bigs.train.plan.config import (
@@ -17,6 +16,7 @@ from bigs.train.plan.config import (
     SplitStage,
     Stage,
 )
+from bigs.train.plan.densify_config import DensifyConfig
 from bigs.train.plan.ranges import check_ranges
 
 # The settings that the renderer is compiled for.

@@ -27,7 +27,8 @@ from bigs.data.ground_truth import load_annotation
 from bigs.hand import load_hand_models
 from bigs.motion.tracker import GivenPoses, TrackerConfig, track
 from bigs.preprocess.artefacts import Alignment
-from bigs.train.start.initial import InitialConfig, object_in_camera, smooth_object
+from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.initial import object_in_camera, smooth_object
 from bigs.types import MASK_VALUES
 
 PAGE = "motion.md"

@@ -14,11 +14,12 @@ from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
-from bigs.train.loop.density import DensifyConfig, Pull, densified
+from bigs.train.loop.density import Pull, densified
 from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_rates
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.terms import Term, terms_of
 from bigs.train.plan.config import OptimizeStage
+from bigs.train.plan.densify_config import DensifyConfig
 from bigs.types import Entity
 
 

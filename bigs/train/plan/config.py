@@ -9,9 +9,8 @@ from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.motion.tracker import TrackerConfig
 from bigs.raster.settings import RasterSettings
-from bigs.train.loop.density import DensifyConfig
-from bigs.train.start.completion import CompletionConfig
-from bigs.train.start.initial import InitialConfig
+from bigs.train.plan.densify_config import DensifyConfig
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 
 StepKind = Literal["single-subject", "interacting-subjects"]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from bigs.fields.triplane import TriplaneConfig
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.train.loop.density import DensifyConfig
 from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
@@ -19,7 +18,8 @@ from bigs.train.plan.config import (
     ScaleSearchStage,
     SplitStage,
 )
-from bigs.train.start.initial import InitialConfig
+from bigs.train.plan.densify_config import DensifyConfig
+from bigs.train.plan.start_config import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
 _POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.005}

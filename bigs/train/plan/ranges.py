@@ -25,8 +25,7 @@ from bigs.train.plan.config import (
     ScaleSearchStage,
     SplitStage,
 )
-from bigs.train.start.completion import CompletionConfig
-from bigs.train.start.initial import InitialConfig
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 
 
 class Range(NamedTuple):

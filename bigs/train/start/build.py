@@ -23,15 +23,9 @@ from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.motion.tracker import TrackedMotion
-from bigs.train.start.completion import CompletionConfig, complete
-from bigs.train.start.initial import (
-    InitialConfig,
-    ObjectStart,
-    hand_in_camera,
-    object_in_camera,
-    smooth_hand,
-    smooth_object,
-)
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
+from bigs.train.start.completion import complete
+from bigs.train.start.initial import ObjectStart, hand_in_camera, object_in_camera, smooth_hand, smooth_object
 from bigs.train.start.object_motion import pose_errors, with_motion
 from bigs.train.start.visual_hull import convex_surface, find_object_hull
 from bigs.types import Side

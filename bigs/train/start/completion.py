@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.ndimage
@@ -13,22 +13,10 @@ from bigs.geometry.coverage import times_empty
 from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid
 from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
-from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
-from bigs.train.start.initial import InitialConfig, ObjectStart
+from bigs.geometry.symmetry_search import find_symmetries
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
+from bigs.train.start.initial import ObjectStart
 from bigs.train.start.visual_hull import ObjectHull
-
-
-@dataclass(frozen=True)
-class CompletionConfig:
-    """When unseen parts are completed by symmetry. Lengths in metres."""
-
-    symmetry: SymmetryConfig = field(default_factory=SymmetryConfig)
-    # Nothing is completed if this share of the surface was seen.
-    enough: float = 0.9
-    # Seen surface supports a symmetry only this near to a point: elsewhere it may belong to the hull alone.
-    measured: float = 0.008
-    # A carried point is new if it is further than this from all others.
-    gap: float = 0.003
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,43 +16,8 @@ from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.smoothing import interpolated_frames, smooth_rotations, smooth_vectors
 from bigs.geometry.surface import inlier_points
 from bigs.hand import HandModel, mirror_rotation
+from bigs.train.plan.start_config import InitialConfig
 from bigs.types import HandObjectTrajectory, Side
-
-
-@dataclass(frozen=True)
-class InitialConfig:
-    """How the clip's estimates become start values."""
-
-    # Width in frames of the robust smoothing of hand and object poses; more than about 2 blurs re-grasps.
-    smooth_hands: float = 2.0
-    smooth_object: float = 2.0
-    # Weight of a frame that the estimator interpolated.
-    interpolated_trust: float = 0.1
-    # Cells along the longest side of the grid on which the object's surface is computed.
-    surface_resolution: int = 80
-    # Distance at which a point's plane loses all influence against the visual hull, metres.
-    surface_reach: float = 0.016
-    # Frames that must agree before a place is carved away, since single masks and poses are wrong.
-    surface_agreeing: int = 3
-    # The surface may exceed the points' convex hull by this much, metres, and more only where the masks show
-    # object in more than this share of the frames.
-    surface_margin: float = 0.002
-    surface_shown: float = 0.8
-    # Surface counts as seen if it shows in this many frames: fewer may be an error of a mask or pose.
-    seen_frames: int = 3
-    # Typical error of poses, metres: nearer surface does not occlude, and space nearer than this is not known
-    # to be empty.
-    seen_tolerance: float = 0.006
-    # Surface further than this from any seen or measured one is a guess, metres. If more than this share of
-    # the surface is a guess and no symmetry supports it, contact ignores it, since closing what was never
-    # seen fills a grip that a hand is in.
-    surface_solid: float = 0.015
-    surface_guessed: float = 0.1
-    # The surface is smoothed over this many cells of its grid: errors of points and masks make it rough,
-    # and Gaussians on a rough surface look torn from other views.
-    surface_smoothing: float = 1.0
-    # The mesh ends this far from any seen or measured surface, metres.
-    surface_kept: float = 0.03
 
 
 class HandStart(NamedTuple):

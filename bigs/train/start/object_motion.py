@@ -19,7 +19,8 @@ from bigs.geometry.arrays import float32
 from bigs.models.poses import PoseErrors
 from bigs.motion.tracker import GivenPoses, TrackedMotion, track
 from bigs.train.plan.config import ObjectMotionStage
-from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera
+from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.initial import ObjectStart, object_in_camera
 from bigs.types import MASK_VALUES
 
 FILE_NAME = "object-motion.npz"

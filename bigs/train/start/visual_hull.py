@@ -21,7 +21,8 @@ from bigs.geometry.surface import (
     point_normals,
     silhouette_around_points,
 )
-from bigs.train.start.initial import InitialConfig, ObjectStart
+from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.initial import ObjectStart
 from bigs.types import MASK_VALUES
 
 # Fewer points give no surface.

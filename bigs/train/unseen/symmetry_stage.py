@@ -22,8 +22,9 @@ from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
 from bigs.train.plan.config import CompletionStage
-from bigs.train.start.completion import Completion, CompletionConfig, complete
-from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
+from bigs.train.start.completion import Completion, complete
+from bigs.train.start.initial import ObjectStart, object_in_camera
 from bigs.train.start.visual_hull import find_object_hull
 from bigs.train.unseen.visibility import (
     SHOWS,

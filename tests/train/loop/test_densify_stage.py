@@ -24,13 +24,13 @@ from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
 from bigs.train.fit import fit
 from bigs.train.loop.checkpoint import FILE_NAME
-from bigs.train.loop.density import DensifyConfig
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageProgress, StageState, choose_frames, run_stage
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.terms import TERMS
 from bigs.train.plan.config import OptimizeStage, RunConfig, SplitStage
 from bigs.train.plan.config_file import from_plain, to_plain, with_changes
+from bigs.train.plan.densify_config import DensifyConfig
 from bigs.train.plan.presets import PRESETS
 from bigs.train.start.background import unknown_occluders
 from bigs.train.switches import without

@@ -12,7 +12,8 @@ from torch import Tensor
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_quat
 from bigs.models.canonical import CanonicalObject
 from bigs.models.object_splats import Anchors
-from bigs.train.loop.density import DensifyConfig, Pull, densified, fates, object_radius
+from bigs.train.loop.density import Pull, densified, fates, object_radius
+from bigs.train.plan.densify_config import DensifyConfig
 
 # Thresholds in round numbers, on an object of radius 1.
 CONFIG = DensifyConfig(threshold=1.0, small=0.01, large=0.1, least_opacity=0.005, floor=1, ceiling=100)

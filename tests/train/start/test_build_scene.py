@@ -19,9 +19,9 @@ from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.raster import rasterization
 from bigs.train.plan.presets import SMOKE
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.build import SceneStart, build_scene, likely_shape
-from bigs.train.start.completion import CompletionConfig
-from bigs.train.start.initial import InitialConfig, initial_trajectory
+from bigs.train.start.initial import initial_trajectory
 from bigs.types import MASK_VALUES, SIDES, Entity, Side
 
 AS_GIVEN = replace(

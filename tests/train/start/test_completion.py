@@ -18,9 +18,10 @@ from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
 from bigs.train.plan.presets import SMOKE
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.build import build_scene
-from bigs.train.start.completion import Completion, CompletionConfig, complete
-from bigs.train.start.initial import InitialConfig, ObjectStart, object_in_camera, smooth_object
+from bigs.train.start.completion import Completion, complete
+from bigs.train.start.initial import ObjectStart, object_in_camera, smooth_object
 from bigs.train.start.visual_hull import ObjectHull, find_object_hull
 from bigs.types import HandObjectTrajectory, Side
 

@@ -14,9 +14,9 @@ from toy_clips import painted_clip
 from bigs.data.base import Clip
 from bigs.geometry.rotations import axis_angle_to_matrix, rotation_angle
 from bigs.hand import HandModel, mirror_rotation
+from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.initial import (
     HandStart,
-    InitialConfig,
     hand_in_camera,
     initial_trajectory,
     object_in_camera,

@@ -7,7 +7,7 @@ import pytest
 
 from bigs.geometry.coverage import ObjectViews
 from bigs.geometry.surface import DistanceGrid, convex_distance, empty_grid
-from bigs.train.start.initial import InitialConfig
+from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.visual_hull import ObjectHull
 
 HALF = np.array([0.03, 0.03, 0.02])

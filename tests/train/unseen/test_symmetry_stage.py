@@ -20,9 +20,8 @@ from bigs.train.fit import FitReport, fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.plan.config import CompletionStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
+from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.resolve import resolve
-from bigs.train.start.completion import CompletionConfig
-from bigs.train.start.initial import InitialConfig
 from bigs.train.unseen.symmetry_stage import blended_colors
 from bigs.train.unseen.visibility import image_error, weights_in_pictures
 from bigs.types import HandObjectTrajectory, Side
