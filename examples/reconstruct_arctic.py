@@ -28,12 +28,12 @@ from bigs.commands.export.submission import submit
 from bigs.commands.preprocess.all_steps import preprocess
 from bigs.commands.preprocess.request import PreprocessRequest
 from bigs.commands.run.reconstruct import reconstruct
-from bigs.data.arctic import find_arctic, read_arctic
+from bigs.data.formats.arctic import find_arctic, read_arctic
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.writers import write_arctic
 from bigs.data.ground_truth import load_annotation
-from bigs.data.hold import load_hold
 from bigs.data.images import IMAGE_SUFFIXES, list_frames
 from bigs.data.synthetic import make_clip
-from bigs.data.writers import write_arctic
 from bigs.export.submission import TEST_SEQUENCES
 from bigs.hand import load_hand_models
 from bigs.preprocess.frames.camera import CameraRequest

@@ -26,12 +26,12 @@ from bigs.checks import InputError
 from bigs.commands.clips.convert import ConvertPlan, convert
 from bigs.commands.evaluate.runs import MADE_BY_CODE, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.run.reconstruct import reconstruct
+from bigs.data.formats.ho3d import CV_FROM_GL
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.writers import write_ho3d
 from bigs.data.ground_truth import load_annotation
-from bigs.data.ho3d import CV_FROM_GL
-from bigs.data.hold import load_hold
 from bigs.data.moving import in_world
 from bigs.data.synthetic import make_clip
-from bigs.data.writers import write_ho3d
 from bigs.hand import load_hand_models
 from bigs.train.plan.presets import PRESETS
 

@@ -27,8 +27,8 @@ from bigs.commands.evaluate.runs import EvaluationPlan, evaluate_run
 from bigs.commands.preprocess.all_steps import preprocess
 from bigs.commands.preprocess.request import PreprocessRequest
 from bigs.commands.run.reconstruct import reconstruct
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import load_hand_models
 from bigs.preprocess.frames.camera import CameraRequest

@@ -15,7 +15,7 @@ from family import Family
 
 from bigs.cli import main
 from bigs.data.base import Clip
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import Side

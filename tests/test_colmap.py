@@ -12,7 +12,7 @@ WAIT = "import time; print('ready', flush=True); time.sleep(60)"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
-@pytest.mark.parametrize("module", ["bigs.colmap", "bigs.data.sfm_folder", "bigs.motion.models"])
+@pytest.mark.parametrize("module", ["bigs.colmap", "bigs.data.formats.sfm_folder", "bigs.motion.models"])
 def test_a_process_that_is_terminated_says_nothing(module: str) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", f"import {module}; {WAIT}"],

@@ -22,7 +22,7 @@ from PIL import Image
 
 from bigs.checks import InputError
 from bigs.commands.folder.contents import load_run
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.export.submission import check_submission
 from bigs.hand import load_hand_models
 from bigs.train.start.initial import initial_trajectory

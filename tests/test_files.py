@@ -20,7 +20,7 @@ from bigs import archives
 from bigs.archives import MAX_MEMBERS, read_npz
 from bigs.checks import InputError, shown
 from bigs.commands.batch.manifest import read_manifest
-from bigs.data.transforms import read_cameras
+from bigs.data.formats.transforms import read_cameras
 from bigs.export.ply import load_splats
 from bigs.export.poses import load_poses
 from bigs.files import MAX_DEPTH, MAX_YAML_BYTES, MAX_YAML_NODES, open_regular, read_json, read_yaml

@@ -25,12 +25,12 @@ from bigs.commands.export.formats import write_format
 from bigs.commands.folder.contents import SCENE, load_run
 from bigs.commands.render.live import view
 from bigs.commands.run.series import PlannedRun
-from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import Clip
-from bigs.data.ho3d import load_ho3d
-from bigs.data.hold import load_hold
-from bigs.data.sfm_folder import load_sfm_folder
-from bigs.data.writers import write_arctic, write_ho3d, write_nerfstudio
+from bigs.data.formats.annotation import Annotation, ObjectTruth
+from bigs.data.formats.ho3d import load_ho3d
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.sfm_folder import load_sfm_folder
+from bigs.data.formats.writers import write_arctic, write_ho3d, write_nerfstudio
 from bigs.export.challenge import load_challenge
 from bigs.export.submission import check_submission
 from bigs.names import MAX_NAME_BYTES, check_inside, check_name, check_path

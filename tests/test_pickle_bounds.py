@@ -17,7 +17,7 @@ import scipy.sparse
 
 from bigs import pickle_records
 from bigs.checks import InputError
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.hand.io import load_hand_model
 from bigs.unpickle import CHUMPY, TENSORS, load_npy, restricted_load
 

@@ -15,9 +15,9 @@ import trimesh
 
 from bigs.archives import read_npz
 from bigs.checks import InputError, check_faces, check_pixels, check_product, check_rotations
-from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, number_field, require
+from bigs.data.entries import array_entry, number_entry, require
+from bigs.data.formats.annotation import Annotation, ObjectTruth
 from bigs.data.meshes import check_solid, read_mesh
 from bigs.files import read_text
 from bigs.names import check_name
@@ -149,7 +149,7 @@ def _object_poses(
     rotations = _field(file, arrays, "obj_R", (frames, 3, 3))
     check_rotations(f"{file}: obj_R", rotations)
     transl = _field(file, arrays, "obj_t", (len(rotations), 3))
-    scale = number_field(f"{file}: obj_scale", arrays["obj_scale"]) if "obj_scale" in arrays else 1.0
+    scale = number_entry(f"{file}: obj_scale", arrays["obj_scale"]) if "obj_scale" in arrays else 1.0
     if scale <= 0:
         raise InputError(f"{file}: obj_scale: expected a positive number, found {scale:g}")
     return rotations, transl, scale
@@ -199,4 +199,4 @@ def _frame_names(file: Path, frames: int) -> tuple[str, ...]:
 def _field(
     file: Path, arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | str, ...]
 ) -> np.ndarray:
-    return array_field(f"{file}: {key}", require(f"{file}: {key}", arrays, key), shape)
+    return array_entry(f"{file}: {key}", require(f"{file}: {key}", arrays, key), shape)

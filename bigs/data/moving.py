@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import check_shape
-from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack, ObjectTrack
+from bigs.data.formats.annotation import Annotation, ObjectTruth
 from bigs.types import Side
 
 Rigid = TypeVar("Rigid", ObjectTrack, ObjectTruth)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bigs.archives import read_npz
 from bigs.checks import InputError
-from bigs.data.fields import array_field, require
+from bigs.data.entries import array_entry, require
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image, read_mask
 
 CAMERAS = "cameras.npz"
@@ -53,7 +53,7 @@ def load_novel_views(folder: str | Path, frame_count: int) -> list[NovelView]:
     views = len(image_paths)
 
     def field(key: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        return array_field(f"{file}: {key}", require(f"{file}: {key}", arrays, key), shape)
+        return array_entry(f"{file}: {key}", require(f"{file}: {key}", arrays, key), shape)
 
     frames = field("frame", (views,)).astype(int)
     if frames.min() < 0 or frames.max() >= frame_count:

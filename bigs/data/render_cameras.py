@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.data.fields import mapping_field, number_field, require
-from bigs.data.transforms import (
+from bigs.data.entries import mapping_entry, number_entry, require
+from bigs.data.formats.transforms import (
     PlacedCamera,
     RenderCamera,
     cameras_in,
@@ -55,7 +55,7 @@ def load_cameras(
             frame out of range, or a time that is given twice.
     """
     path = Path(path)
-    document = mapping_field(str(path), read_json(path))
+    document = mapping_entry(str(path), read_json(path))
     fps = None
     if "camera_path" in document:
         placed = _path_cameras(path, document, size)
@@ -106,10 +106,10 @@ def _path_cameras(
     cameras = []
     for index, entry in enumerate(stored):
         where = f"{path}: camera_path[{index}]"
-        entry = mapping_field(where, entry)
+        entry = mapping_entry(where, entry)
         matrix = require(f"{where}.camera_to_world", entry, "camera_to_world")
         viewmat = viewmat_field(f"{where}.camera_to_world", _rows(f"{where}.camera_to_world", matrix))
-        fov = number_field(f"{where}.fov", require(f"{where}.fov", entry, "fov"))
+        fov = number_entry(f"{where}.fov", require(f"{where}.fov", entry, "fov"))
         if not 0 < fov < 180:
             raise InputError(f"{where}.fov: expected degrees between 0 and 180, found {fov:g}")
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov))
@@ -127,7 +127,7 @@ def _rows(where: str, stored: Any) -> list[list[Any]]:
 
 
 def _positive(where: str, value: Any) -> float:
-    number = number_field(where, value)
+    number = number_entry(where, value)
     if number <= 0:
         raise InputError(f"{where}: expected a positive number, found {number:g}")
     return number

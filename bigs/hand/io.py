@@ -78,7 +78,7 @@ def load_hand_model(path: str | Path, side: Side) -> HandModel:
         raise InputError(
             f"{file}: expected a hand model file (.npz or .pkl) or a folder of them, found {found_at(file)}"
         )
-    return hand_model_from_fields(read_model_file(file), side, name=str(file))
+    return hand_model_from_arrays(read_model_file(file), side, name=str(file))
 
 
 def find_model_file(folder: Path, side: Side) -> Path | None:
@@ -92,7 +92,7 @@ def find_model_file(folder: Path, side: Side) -> Path | None:
 
 
 def read_model_file(file: Path) -> dict[str, Any]:
-    """The raw fields of an .npz file or of a .pkl file in MANO's original layout, unchecked.
+    """The raw arrays of an .npz file or of a .pkl file in MANO's original layout, unchecked.
 
     Raises:
         InputError: the file cannot be read, or is a pickle of anything but data.
@@ -102,44 +102,44 @@ def read_model_file(file: Path) -> dict[str, Any]:
     if file.suffix != ".pkl":
         raise InputError(f"{file}: expected a hand model with suffix .npz or .pkl, found '{file.suffix}'")
     with open_regular(file, "a hand model") as stream:
-        fields = restricted_load(stream, name=str(file), allow=CHUMPY)
-    if not isinstance(fields, dict):
-        raise InputError(f"{file}: expected a pickled dict of fields, found {type(fields).__name__}")
-    return fields
+        arrays = restricted_load(stream, name=str(file), allow=CHUMPY)
+    if not isinstance(arrays, dict):
+        raise InputError(f"{file}: expected a pickled dictionary of arrays, found {type(arrays).__name__}")
+    return arrays
 
 
-def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> HandModel:
-    """A checked `HandModel` from MANO's fields.
+def hand_model_from_arrays(arrays: dict[str, Any], side: Side, *, name: str) -> HandModel:
+    """A checked `HandModel` from MANO's arrays.
 
     Args:
-        fields: arrays under MANO's key names; `tip_vertex_ids` [5] is needed unless there are 778 vertices.
-        side: which hand the fields should describe.
+        arrays: under MANO's key names; `tip_vertex_ids` [5] is needed unless there are 778 vertices.
+        side: which hand they should describe.
         name: what to call their source in messages.
 
     Raises:
         InputError: a field is missing, has another shape, is not finite, or contradicts the others.
     """
-    missing = [key for key in REQUIRED if key not in fields]
+    missing = [key for key in REQUIRED if key not in arrays]
     if missing:
-        raise InputError(f"{name}: expected a hand model with field '{missing[0]}', found {_listed(fields)}")
+        raise InputError(f"{name}: expected a hand model with field '{missing[0]}', found {_listed(arrays)}")
     joints = len(MANO_PARENTS)
-    v_template = _floats(fields, "v_template", ("V", 3), name)
+    v_template = _floats(arrays, "v_template", ("V", 3), name)
     vertices = len(v_template)
     _check_extent(v_template, name)
-    weights = _floats(fields, "weights", (vertices, joints), name)
-    regressor = _floats(fields, "J_regressor", (joints, vertices), name)
-    shapedirs = _floats(fields, "shapedirs", (vertices, 3, 10), name)
-    posedirs = _floats(fields, "posedirs", (vertices, 3, 9 * (joints - 1)), name)
-    hands_mean = _floats(fields, "hands_mean", None, name)
+    weights = _floats(arrays, "weights", (vertices, joints), name)
+    regressor = _floats(arrays, "J_regressor", (joints, vertices), name)
+    shapedirs = _floats(arrays, "shapedirs", (vertices, 3, 10), name)
+    posedirs = _floats(arrays, "posedirs", (vertices, 3, 9 * (joints - 1)), name)
+    hands_mean = _floats(arrays, "hands_mean", None, name)
     if hands_mean.size != 3 * (joints - 1):
         raise InputError(f"{name}, hands_mean: expected 45 values, found shape {list(hands_mean.shape)}")
-    faces = _integers(fields, "f", ("F", 3), name)
+    faces = _integers(arrays, "f", ("F", 3), name)
     _check_indices(f"{name}, f", faces, vertices)
     _check_rows_sum_to_one(f"{name}, weights", weights)
     _check_rows_sum_to_one(f"{name}, J_regressor", regressor)
     if weights.min() < -SUM_TOLERANCE:
         raise InputError(f"{name}, weights: expected no negative skinning weight, found {weights.min():.4g}")
-    _check_tree(fields, name)
+    _check_tree(arrays, name)
     _check_side((regressor @ v_template), side, name)
     return HandModel(
         side,
@@ -150,23 +150,23 @@ def hand_model_from_fields(fields: dict[str, Any], side: Side, *, name: str) -> 
         J_regressor=regressor,
         lbs_weights=weights,
         hands_mean=hands_mean.reshape(-1, 3),
-        tip_vertex_ids=_tips(fields, vertices, name),
+        tip_vertex_ids=_tips(arrays, vertices, name),
     )
 
 
-def _listed(fields: dict[str, Any]) -> str:
-    names = sorted(map(str, fields))
+def _listed(arrays: dict[str, Any]) -> str:
+    names = sorted(map(str, arrays))
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "") if names else "no field at all"
 
 
-def _floats(fields: dict[str, Any], key: str, shape: tuple[int | str, ...] | None, name: str) -> np.ndarray:
-    value = fields[key]
+def _floats(arrays: dict[str, Any], key: str, shape: tuple[int | str, ...] | None, name: str) -> np.ndarray:
+    value = arrays[key]
     if scipy.sparse.issparse(value):
         # Check the shape before a forged sparse matrix is made dense.
         if shape is not None:
             check_shape(f"{name}, {key}", value, shape)
         value = value.toarray()
-    # Lists may be ragged or hold text; MANO's own fields are arrays.
+    # Lists may be ragged or hold text; MANO stores arrays.
     if not isinstance(value, np.ndarray | np.number):
         raise InputError(f"{name}, {key}: expected an array of numbers, found {type(value).__name__}")
     array = np.asarray(value)
@@ -178,8 +178,8 @@ def _floats(fields: dict[str, Any], key: str, shape: tuple[int | str, ...] | Non
     return array.astype(np.float64)
 
 
-def _integers(fields: dict[str, Any], key: str, shape: tuple[int | str, ...], name: str) -> np.ndarray:
-    array = _floats(fields, key, shape, name)
+def _integers(arrays: dict[str, Any], key: str, shape: tuple[int | str, ...], name: str) -> np.ndarray:
+    array = _floats(arrays, key, shape, name)
     if (array != np.round(array)).any():
         raise InputError(f"{name}, {key}: expected whole numbers, found {array[array != np.round(array)][0]}")
     return array.astype(np.int64)
@@ -204,8 +204,8 @@ def _check_rows_sum_to_one(name: str, matrix: np.ndarray) -> None:
         raise InputError(f"{name}: expected rows that sum to 1, found {sums[row]:.4g} in row {row}")
 
 
-def _check_tree(fields: dict[str, Any], name: str) -> None:
-    table = _integers(fields, "kintree_table", (2, len(MANO_PARENTS)), name)
+def _check_tree(arrays: dict[str, Any], name: str) -> None:
+    table = _integers(arrays, "kintree_table", (2, len(MANO_PARENTS)), name)
     # The root's own parent is stored as 2**32 - 1 or -1 and is ignored.
     found = tuple(int(parent) for parent in table[0, 1:])
     if found != MANO_PARENTS[1:]:
@@ -227,9 +227,9 @@ def _check_side(joints: np.ndarray, side: Side, name: str) -> None:
         )
 
 
-def _tips(fields: dict[str, Any], vertices: int, name: str) -> np.ndarray:
-    if "tip_vertex_ids" in fields:
-        tips = _integers(fields, "tip_vertex_ids", (5,), name)
+def _tips(arrays: dict[str, Any], vertices: int, name: str) -> np.ndarray:
+    if "tip_vertex_ids" in arrays:
+        tips = _integers(arrays, "tip_vertex_ids", (5,), name)
         _check_indices(f"{name}, tip_vertex_ids", tips, vertices)
         return tips
     if vertices != MANO_VERTICES:

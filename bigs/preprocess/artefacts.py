@@ -1,8 +1,6 @@
-"""The files of preprocessing steps below `CLIP/processed`, and whether they are up to date.
+"""What preprocessing steps leave for each other below `CLIP/processed`.
 
-Every artefact names its format's `version` and a digest of its `inputs`. A step whose artefact carries the
-digest that its inputs have now is skipped; one whose inputs changed is done again. An artefact without a
-digest was supplied by another tool and is kept as it is. All is in the OpenCV camera frame of its time.
+`stamps.py` says which of these files are up to date. All poses are in the OpenCV camera frame of their time.
 
     frames/%04d.png, frames.json    RGB images; original names, frames a second, K and how K was found
     masks/%04d.png, masks.json      label images 0, 50 object, 150 right, 250 left; what looks wrong in them
@@ -13,26 +11,20 @@ digest was supplied by another tool and is kept as it is. All is in the OpenCV c
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from bigs.archives import read_npz
-from bigs.atomic import atomic_write
 from bigs.checks import InputError, shown
 from bigs.data.base import HandTrack
-from bigs.data.fields import array_field, mapping_field, require
-from bigs.files import read_json
+from bigs.data.entries import array_entry, require
 from bigs.names import check_name
+from bigs.preprocess.stamps import read_stamped_json, read_stamped_npz, write_json, write_npz
 from bigs.types import SIDES, Side
 
-VERSION = 1
 PROCESSED = "processed"
 FRAMES, FRAMES_FILE = "frames", "frames.json"
 MASKS, MASKS_FILE = "masks", "masks.json"
@@ -42,8 +34,6 @@ ALIGNED_FILE = "aligned.npz"
 
 # No picture has more pixels on a side.
 _MOST_PIXELS = 1 << 16
-
-State = Literal["missing", "current", "outdated", "supplied"]
 
 
 @dataclass(frozen=True)
@@ -89,42 +79,6 @@ class Alignment:
     hand_transl: dict[Side, np.ndarray]  # [T, 3] metres, replaces that of `HandTrack`
 
 
-def content_digest(*parts: Any) -> str:
-    """A digest of a step's inputs.
-
-    Args:
-        parts: a path stands for its content (a folder for the names and contents of its files, a missing one
-            for its absence), anything else for itself as JSON.
-    """
-    found = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, Path):
-            _add_path(found, part)
-        else:
-            found.update(b"json" + json.dumps(part, sort_keys=True, default=_plain).encode() + b"\0")
-    return found.hexdigest()
-
-
-def state_of(path: Path, inputs: str) -> State:
-    """Whether the artefact `path` (.json or .npz) has to be made.
-
-    Args:
-        path: the file that carries the stamp.
-        inputs: the `content_digest` of what the step would read now.
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    if not path.is_file():
-        return "missing"
-    stored = _read_json(path) if path.suffix == ".json" else _read_npz(path, ("version", "inputs"))
-    if not str(stored.get("inputs", "")):
-        return "supplied"
-    # As text, whatever the value is.
-    current = str(stored.get("version")) == str(VERSION) and str(stored["inputs"]) == inputs
-    return "current" if current else "outdated"
-
-
 def write_frame_set(processed: Path, frames: FrameSet, inputs: str) -> None:
     """Write `frames.json`; the images must be there already, since this file says that they are whole."""
     write_json(processed / FRAMES_FILE, asdict(frames) | {"K": frames.K.tolist()}, inputs)
@@ -137,14 +91,14 @@ def read_frame_set(processed: Path) -> FrameSet:
         InputError: missing, damaged, or a field is invalid.
     """
     file = processed / FRAMES_FILE
-    stored = _read_json(file)
+    stored = read_stamped_json(file)
     names = require(f"{file}: names", stored, "names")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise InputError(f"{file}: names: expected a list of frame names, found {shown(names)}")
     for name in names:
         check_name(f"{file}: names", name)
     size = {key: _pixels(file, stored, key) for key in ("width", "height")}
-    K = array_field(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
+    K = array_entry(f"{file}: K", require(f"{file}: K", stored, "K"), (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise InputError(f"{file}: K: expected positive focal lengths over (0, 0, 1), found {K.tolist()}")
     source = {
@@ -228,19 +182,19 @@ def read_hands(path: Path, frames: int) -> dict[Side, HandTrack]:
     Raises:
         InputError: missing, damaged, no hand in it, or a field is invalid.
     """
-    stored = _read_npz(path)
+    stored = read_stamped_npz(path)
     sides = [side for side in SIDES if f"{side}.global_orient" in stored]
     if not sides:
         raise InputError(f"{path}: expected right.global_orient or left.global_orient, found {_some(stored)}")
     hands: dict[Side, HandTrack] = {}
     for side in sides:
-        field = _fields_of(path, stored, f"{side}.")
+        entry = _entries_of(path, stored, f"{side}.")
         hands[side] = HandTrack(
-            global_orient=field("global_orient", (frames, 3)),
-            hand_pose=field("hand_pose", (frames, 45)).reshape(frames, 15, 3),
-            transl=field("transl", (frames, 3)),
-            betas=field("betas", (10,)),
-            valid=field("valid", (frames,)).astype(bool),
+            global_orient=entry("global_orient", (frames, 3)),
+            hand_pose=entry("hand_pose", (frames, 45)).reshape(frames, 15, 3),
+            transl=entry("transl", (frames, 3)),
+            betas=entry("betas", (10,)),
+            valid=entry("valid", (frames,)).astype(bool),
         )
     return hands
 
@@ -251,8 +205,8 @@ def read_depth_sigma(path: Path) -> float:
     Raises:
         InputError: missing, damaged, or not a positive number.
     """
-    stored = _read_npz(path)
-    value = float(array_field(f"{path}: depth_sigma", stored.get("depth_sigma", USUAL_DEPTH_SIGMA), ()))
+    stored = read_stamped_npz(path)
+    value = float(array_entry(f"{path}: depth_sigma", stored.get("depth_sigma", USUAL_DEPTH_SIGMA), ()))
     if value <= 0:
         raise InputError(f"{path}: depth_sigma: expected a positive number, found {value:g}")
     return value
@@ -271,22 +225,22 @@ def read_object_sfm(path: Path, frames: int) -> ObjectSfm:
     Raises:
         InputError: missing, damaged, or a field is invalid.
     """
-    stored = _read_npz(path)
-    field = _fields_of(path, stored, "")
-    rotations = field("R", (frames, 3, 3))
+    stored = read_stamped_npz(path)
+    entry = _entries_of(path, stored, "")
+    rotations = entry("R", (frames, 3, 3))
     bad = np.flatnonzero(np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-3)
     if bad.size:
         raise InputError(f"{path}: R: expected rotation matrices, found another matrix in frame {bad[0]}")
-    points = field("points", ("N", 3))
+    points = entry("points", ("N", 3))
     stored_colors = stored.get("colors", np.full(points.shape, 128))
     return ObjectSfm(
         rotations=rotations,
-        transl=field("t", (frames, 3)),
-        valid=field("valid", (frames,)).astype(bool),
-        confidence=field("confidence", (frames,)),
+        transl=entry("t", (frames, 3)),
+        valid=entry("valid", (frames,)).astype(bool),
+        confidence=entry("confidence", (frames,)),
         points=points,
-        colors=array_field(f"{path}: colors", stored_colors, (len(points), 3)).astype(np.uint8),
-        norm_mat=field("norm_mat", (4, 4)),
+        colors=array_entry(f"{path}: colors", stored_colors, (len(points), 3)).astype(np.uint8),
+        norm_mat=entry("norm_mat", (4, 4)),
     )
 
 
@@ -307,18 +261,18 @@ def read_alignment(path: Path, frames: int) -> Alignment:
     Raises:
         InputError: missing, damaged, or a field is invalid.
     """
-    stored = _read_npz(path)
-    field = _fields_of(path, stored, "")
-    scale = float(field("scale", ()))
+    stored = read_stamped_npz(path)
+    entry = _entries_of(path, stored, "")
+    scale = float(entry("scale", ()))
     if scale <= 0:
         raise InputError(f"{path}: scale: expected a positive number, found {scale:g}")
     return Alignment(
         scale=scale,
-        object_rotations=field("object_rotations", (frames, 3, 3)),
-        object_transl=field("object_transl", (frames, 3)),
-        object_valid=field("object_valid", (frames,)).astype(bool),
+        object_rotations=entry("object_rotations", (frames, 3, 3)),
+        object_transl=entry("object_transl", (frames, 3)),
+        object_valid=entry("object_valid", (frames,)).astype(bool),
         hand_transl={
-            side: field(f"{side}.transl", (frames, 3)) for side in SIDES if f"{side}.transl" in stored
+            side: entry(f"{side}.transl", (frames, 3)) for side in SIDES if f"{side}.transl" in stored
         },
     )
 
@@ -331,45 +285,20 @@ def read_notes(file: Path) -> tuple[str, ...]:
     """
     if not file.exists():
         return ()
-    notes = _read_json(file).get("notes", [])
+    notes = read_stamped_json(file).get("notes", [])
     if not isinstance(notes, list):
         raise InputError(f"{file}: notes: expected a list of sentences, found {type(notes).__name__}")
     return tuple(map(str, notes))
 
 
-def write_npz(path: Path, arrays: Mapping[str, Any], inputs: str) -> None:
-    """Write arrays with their stamp; the file is whole or absent."""
-    with atomic_write(path) as file:
-        np.savez_compressed(file, version=np.int64(VERSION), inputs=np.str_(inputs), **arrays)
+def _entries_of(path: Path, stored: Mapping[str, Any], prefix: str) -> Any:
+    """A function that takes a named entry out of `stored`, checked."""
 
-
-def write_json(path: Path, fields: Mapping[str, Any], inputs: str) -> None:
-    """Write fields with their stamp as JSON; the file is whole or absent."""
-    text = json.dumps({"version": VERSION, "inputs": inputs, **fields}, indent=1, default=_plain)
-    with atomic_write(path) as file:
-        file.write(text.encode() + b"\n")
-
-
-def _fields_of(path: Path, stored: Mapping[str, Any], prefix: str) -> Any:
-    """A function that takes a named field out of `stored`, checked."""
-
-    def field(name: str, shape: Sequence[int | str]) -> np.ndarray:
+    def entry(name: str, shape: Sequence[int | str]) -> np.ndarray:
         where = f"{path}: {prefix}{name}"
-        return array_field(where, require(where, stored, prefix + name), shape)
+        return array_entry(where, require(where, stored, prefix + name), shape)
 
-    return field
-
-
-def _add_path(found: Any, path: Path) -> None:
-    if path.is_dir():
-        for file in sorted(p for p in path.rglob("*") if p.is_file() and not p.name.startswith(".")):
-            found.update(b"name" + os.fsencode(file.relative_to(path)) + b"\0")
-            _add_path(found, file)
-    elif path.is_file():
-        with path.open("rb") as stream:
-            found.update(b"file" + hashlib.file_digest(stream, "sha256").digest())
-    else:
-        found.update(b"absent\0")
+    return entry
 
 
 def _numbered(folder: Path, count: int) -> list[Path]:
@@ -382,7 +311,7 @@ def _numbered(folder: Path, count: int) -> list[Path]:
 
 def _counts(where: str, value: Any, shape: Sequence[int | str]) -> np.ndarray:
     """Whole numbers of 0 or more."""
-    counts = array_field(where, value, shape)
+    counts = array_entry(where, value, shape)
     if (counts < 0).any() or (counts != np.floor(counts)).any():
         raise InputError(f"{where}: expected whole numbers of 0 or more, found {shown(value)}")
     return counts.astype(int)
@@ -397,24 +326,11 @@ def _pixels(file: Path, stored: Mapping[str, Any], key: str) -> int:
 
 
 def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:
-    value = float(array_field(f"{file}: {key}", require(f"{file}: {key}", stored, key), ()))
+    value = float(array_entry(f"{file}: {key}", require(f"{file}: {key}", stored, key), ()))
     if value <= 0:
         raise InputError(f"{file}: {key}: expected a positive number, found {value:g}")
     return value
 
 
-def _read_json(file: Path) -> Mapping[str, Any]:
-    return mapping_field(str(file), read_json(file, "what an earlier step writes"))
-
-
-def _read_npz(file: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    return read_npz(file, "what an earlier step writes", keys)
-
-
-def _plain(value: Any) -> Any:
-    """Convert what JSON does not know."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
-def _some(fields: Mapping[str, Any]) -> str:
-    return ", ".join(list(fields)[:6]) or "no fields"
+def _some(stored: Mapping[str, Any]) -> str:
+    return ", ".join(list(stored)[:6]) or "no fields"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack, ObjectTrack
-from bigs.data.hold import GL_FROM_CV, write_hold
+from bigs.data.formats.hold import GL_FROM_CV, write_hold
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
 from bigs.types import Side

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_clip import FRAMES, HEIGHT, SHIFT, WIDTH, K, random_hand, random_object, small_masks
 
-from bigs.data.hold import write_hold
+from bigs.data.formats.hold import write_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import Side

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bigs.data.annotation import Annotation, ObjectTruth
 from bigs.data.base import HandTrack, ObjectTrack
+from bigs.data.formats.annotation import Annotation, ObjectTruth
 
 FRAMES = 5
 WIDTH, HEIGHT = 24, 16

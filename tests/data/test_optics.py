@@ -13,9 +13,9 @@ from PIL import Image
 from small_clip import FRAMES, small_annotation
 
 from bigs.checks import InputError
-from bigs.data.arctic import load_arctic
+from bigs.data.formats.arctic import load_arctic
+from bigs.data.formats.writers import write_arctic
 from bigs.data.optics import Optics, distort
-from bigs.data.writers import write_arctic
 
 # As strong as a lens worn on the head, with every kind of term.
 LENS = np.array([-0.21, 0.06, 0.002, -0.003, 0.01, 0.05, -0.02, 0.004])

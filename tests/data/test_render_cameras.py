@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
+from bigs.data.formats.transforms import MOST_CAMERAS, RenderCamera, write_transforms
 from bigs.data.render_cameras import load_cameras
-from bigs.data.transforms import MOST_CAMERAS, RenderCamera, write_transforms
 
 IDENTITY = np.eye(4).tolist()
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from bigs.checks import InputError, check_product
-from bigs.data.arctic import camera_of_images
+from bigs.data.formats.arctic import camera_of_images
 from bigs.data.ground_truth import load_annotation, load_ground_truth
 
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.data.synthetic import OBJECT_KINDS, make_clip
 from bigs.data.synthetic.grasp import find_grasp, pose_hand
 from bigs.data.synthetic.objects import make_object

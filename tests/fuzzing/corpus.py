@@ -15,11 +15,11 @@ import yaml
 from bigs.cli import main
 from bigs.colmap import pycolmap
 from bigs.commands.clips.convert import rest_wrist
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.writers import CV_FROM_GL, write_arctic, write_colmap, write_ho3d, write_nerfstudio
 from bigs.data.ground_truth import load_annotation
-from bigs.data.hold import load_hold
 from bigs.data.moving import in_world, move_hand, move_object
 from bigs.data.synthetic import make_clip
-from bigs.data.writers import CV_FROM_GL, write_arctic, write_colmap, write_ho3d, write_nerfstudio
 from bigs.hand import HandModel, load_hand_models
 from bigs.models.playback_file import load_playback, save_playback
 from bigs.types import SIDES

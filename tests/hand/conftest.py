@@ -46,9 +46,9 @@ def fields(right: HandModel) -> dict[str, Any]:
 @pytest.fixture
 def rich_right(fields: dict[str, Any]) -> HandModel:
     """A right hand with pose correctives and a mean pose, so that nothing is tested on zeros."""
-    from bigs.hand.io import hand_model_from_fields
+    from bigs.hand.io import hand_model_from_arrays
 
-    return hand_model_from_fields(fields, "right", name="test").double()
+    return hand_model_from_arrays(fields, "right", name="test").double()
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ import torch
 
 from bigs.checks import InputError
 from bigs.hand import HandModel, load_hand_model, load_hand_models
-from bigs.hand.io import hand_model_from_fields
+from bigs.hand.io import hand_model_from_arrays
 
 Fields = dict[str, Any]
 
@@ -99,7 +99,7 @@ def test_a_missing_left_file_is_the_mirrored_right(tmp_path: Path, fields: Field
     np.savez(tmp_path / "MANO_RIGHT.npz", **fields)
     hands = load_hand_models(tmp_path)
     assert torch.equal(hands["left"].v_template, hands["right"].mirrored().v_template)
-    other = hand_model_from_fields(fields, "right", name="x").mirrored()
+    other = hand_model_from_arrays(fields, "right", name="x").mirrored()
     np.savez(tmp_path / "MANO_LEFT.npz", **(fields | {"v_template": 1.01 * other.v_template.numpy()}))
     assert not torch.equal(load_hand_models(tmp_path)["left"].v_template, hands["left"].v_template)
 
@@ -112,7 +112,7 @@ def test_mano_itself_needs_no_list_of_fingertips(fields: Fields) -> None:
     regressor = fields["J_regressor"][:, keep]
     cut["J_regressor"] = regressor / regressor.sum(1, keepdims=True)
     cut["f"] = rng.integers(0, 778, (1538, 3))
-    assert hand_model_from_fields(cut, "right", name="x").tip_vertex_ids.tolist() == [744, 320, 443, 554, 671]
+    assert hand_model_from_arrays(cut, "right", name="x").tip_vertex_ids.tolist() == [744, 320, 443, 554, 671]
 
 
 def changed(key: str, change: Callable[[Any], Any]) -> Callable[[Fields], Fields]:
@@ -168,7 +168,7 @@ def without(key: str) -> Callable[[Fields], Fields]:
 )
 def test_bad_fields_are_named(fields: Fields, change: Callable[[Fields], Fields], words: list[str]) -> None:
     with pytest.raises(InputError) as caught:
-        hand_model_from_fields(change(fields), "right", name="some/file.npz")
+        hand_model_from_arrays(change(fields), "right", name="some/file.npz")
     message = str(caught.value)
     assert message.startswith("some/file.npz")
     assert "\n" not in message

@@ -12,8 +12,8 @@ import pytest
 from taken_apart import Given
 from torch import Tensor
 
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.preprocess.hands import tracks
 from bigs.preprocess.hands.fit import HandFit, HandFitConfig, fit_rays
 from bigs.preprocess.hands.skeleton import HandSkeleton

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models

@@ -18,19 +18,17 @@ from bigs.preprocess.artefacts import (
     Alignment,
     FrameSet,
     ObjectSfm,
-    content_digest,
     read_alignment,
     read_depth_sigma,
     read_frame_set,
     read_hands,
     read_object_sfm,
-    state_of,
     write_alignment,
     write_frame_set,
     write_hands,
-    write_npz,
     write_object_sfm,
 )
+from bigs.preprocess.stamps import content_digest, state_of, write_npz
 
 T = 4
 FRAME_SET = FrameSet(

@@ -12,7 +12,7 @@ import pytest
 from command_line import Answer, assert_refused
 from taken_apart import Given, place_true_object
 
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.data.images import read_image
 from bigs.viewer.preview import write_video
 

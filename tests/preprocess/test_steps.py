@@ -16,8 +16,8 @@ from taken_apart import Given, place_true_object
 from bigs.checks import InputError
 from bigs.commands.preprocess.all_steps import preprocess
 from bigs.commands.preprocess.request import PreprocessRequest, StepOutcome
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.hand import HandModel
 from bigs.metrics.report import evaluate
 from bigs.preprocess.frames.camera import CameraRequest

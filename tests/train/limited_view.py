@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, HandObjectTrajectory, Side

@@ -25,8 +25,8 @@ from bigs.commands.folder.contents import write_json
 from bigs.commands.preprocess.all_steps import preprocess
 from bigs.commands.preprocess.request import PreprocessRequest
 from bigs.data.base import Clip
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_annotation, load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.geometry.rotations import robust_mean_rotation
 from bigs.hand import HandModel, load_hand_models
 from bigs.metrics.report import evaluate

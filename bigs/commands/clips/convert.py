@@ -15,11 +15,11 @@ from PIL import Image
 from bigs.checks import InputError
 from bigs.commands.clips.open import open_clip
 from bigs.commands.clips.truth import pose_annotation, read_annotation
-from bigs.data.annotation import Annotation
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
+from bigs.data.formats.annotation import Annotation
+from bigs.data.formats.hold import GL_FROM_CV, write_hold
 from bigs.data.ground_truth import write_ground_truth
-from bigs.data.hold import GL_FROM_CV, write_hold
 from bigs.data.images import MASK_SUFFIXES, check_pairs, decode_frames, list_frames
 from bigs.data.limited_view import limited_frames, object_directions
 from bigs.data.moving import in_world, move_hand, move_object

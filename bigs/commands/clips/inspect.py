@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bigs.commands.clips.open import open_clip
-from bigs.data.layouts import LAYOUT_NAMES, layout_of
+from bigs.data.formats.layouts import LAYOUT_NAMES, layout_of
 from bigs.hand import load_hand_models
 
 

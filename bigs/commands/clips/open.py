@@ -9,14 +9,14 @@ import torch
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
-from bigs.data.layouts import load_clip
+from bigs.data.formats.layouts import load_clip
 from bigs.data.plausible import plausible
 from bigs.hand import HandModel
 from bigs.types import Side
 
 
 def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
-    """A clip of any layout that `bigs.data.layouts` knows, with single faults repaired and noted.
+    """A clip of any layout that `bigs.data.formats.layouts` knows, with single faults repaired and noted.
 
     Raises:
         InputError: the clip is invalid or implausible.

@@ -11,11 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, found_at
-from bigs.data.annotation import Annotation
-from bigs.data.arctic import find_arctic, read_arctic
 from bigs.data.excerpt import excerpt_trajectory
+from bigs.data.formats.annotation import Annotation
+from bigs.data.formats.arctic import find_arctic, read_arctic
+from bigs.data.formats.ho3d import find_ho3d, read_ho3d
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.ho3d import find_ho3d, read_ho3d
 from bigs.hand import HandModel
 from bigs.types import HandObjectTrajectory, Side
 

@@ -21,7 +21,7 @@ from bigs.commands.evaluate.picture_scores import frame_scores, means, novel_sco
 from bigs.commands.folder.clip import hand_models_of_run, origin_of
 from bigs.commands.folder.contents import METRICS, REPORT, load_run, read_scores, write_json
 from bigs.data.base import Clip
-from bigs.data.ho3d import find_ho3d
+from bigs.data.formats.ho3d import find_ho3d
 from bigs.data.novel import CAMERAS
 from bigs.hand import HandModel, load_hand_models
 from bigs.losses.perceptual import VggWeights, perceptual_distance

@@ -9,7 +9,7 @@ from typing import Any
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, found_at, meant
-from bigs.data.fields import array_field, mapping_field
+from bigs.data.entries import array_entry, mapping_entry
 from bigs.files import read_json
 from bigs.models.playback import Playback
 from bigs.models.playback_file import load_playback
@@ -51,11 +51,11 @@ def read_scores(run: Path) -> dict[str, dict[str, float]]:
     path = run / METRICS
     if not path.exists():
         return {}
-    stored = mapping_field(str(path), read_json(path, "a run's scores"))
+    stored = mapping_entry(str(path), read_json(path, "a run's scores"))
     return {
         column: {
-            key: float(array_field(f"{path}: {column}.{key}", value, (), finite=False))
-            for key, value in mapping_field(f"{path}: {column}", scores).items()
+            key: float(array_entry(f"{path}: {column}.{key}", value, (), finite=False))
+            for key, value in mapping_entry(f"{path}: {column}", scores).items()
         }
         for column, scores in stored.items()
     }

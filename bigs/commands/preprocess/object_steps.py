@@ -25,7 +25,6 @@ from bigs.preprocess.artefacts import (
     Alignment,
     FrameSet,
     ObjectSfm,
-    content_digest,
     frame_paths,
     mask_paths,
     read_alignment,
@@ -36,12 +35,12 @@ from bigs.preprocess.artefacts import (
     read_object_sfm,
     write_alignment,
     write_frame_set,
-    write_json,
     write_object_sfm,
 )
 from bigs.preprocess.hands.tracks import joints_of_track
 from bigs.preprocess.object.learned_features import load_matcher
 from bigs.preprocess.object.sfm import SfmConfig, SfmReport, structure_from_motion
+from bigs.preprocess.stamps import content_digest, write_json
 from bigs.types import Side
 
 # What structure from motion has to say of every frame.

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from bigs.preprocess.artefacts import PROCESSED, State, state_of
+from bigs.preprocess.artefacts import PROCESSED
 from bigs.preprocess.frames.extract import FrameConfig
+from bigs.preprocess.stamps import State, state_of
 from bigs.types import Entity
 
 StepName = Literal["frames", "masks", "hands", "object", "align", "build"]

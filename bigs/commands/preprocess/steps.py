@@ -12,7 +12,7 @@ from bigs.checks import InputError, found_at
 from bigs.commands.preprocess.pictures import draw_clip, tinted, with_skeletons, write_sheet
 from bigs.commands.preprocess.request import PreprocessRequest, StepOutcome, kept
 from bigs.data.base import HandTrack
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.data.images import read_image, read_mask
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.artefacts import (
@@ -25,7 +25,6 @@ from bigs.preprocess.artefacts import (
     SFM_FILE,
     USUAL_DEPTH_SIGMA,
     FrameSet,
-    content_digest,
     frame_paths,
     mask_paths,
     read_alignment,
@@ -34,7 +33,6 @@ from bigs.preprocess.artefacts import (
     read_notes,
     read_object_sfm,
     write_hands,
-    write_json,
 )
 from bigs.preprocess.build import write_build
 from bigs.preprocess.frames.extract import extract_frames, frame_inputs
@@ -51,6 +49,7 @@ from bigs.preprocess.masks.clicks import add_hand_clicks, read_clicks
 from bigs.preprocess.masks.masks import MaskSource, open_masks, write_masks
 from bigs.preprocess.masks.sam2 import load_sam2, no_weights, segment_clip
 from bigs.preprocess.object.surface_points import SurfacePointsConfig, complete_points
+from bigs.preprocess.stamps import content_digest, write_json
 from bigs.types import Side
 
 BUILD_FILE = "build.json"

@@ -19,7 +19,7 @@ from torch import Tensor
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_faces, check_finite, found_at
 from bigs.commands.prior.fit import read_state, state_path
-from bigs.data.fields import LARGEST
+from bigs.data.entries import LARGEST
 from bigs.data.mesh_files import MESH_SUFFIXES, load_mesh_file
 from bigs.files import read_bytes
 from bigs.geometry.arrays import float32

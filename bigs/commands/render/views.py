@@ -17,8 +17,8 @@ from bigs.checks import InputError, check_pixels
 from bigs.commands.export.formats import FPS
 from bigs.commands.folder.contents import load_run
 from bigs.commands.render.frame import render_depth, render_frame, straight_rgba, turned_camera
+from bigs.data.formats.transforms import MOST_CAMERAS, MOST_PIXELS, RenderCamera
 from bigs.data.render_cameras import CameraPath, load_cameras
-from bigs.data.transforms import MOST_CAMERAS, MOST_PIXELS, RenderCamera
 from bigs.models.playback import Playback
 from bigs.types import Entity
 from bigs.viewer.preview import save_picture, to_bytes, write_video

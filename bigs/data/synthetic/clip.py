@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, check_choice
 from bigs.data.base import HandTrack, ObjectTrack
+from bigs.data.formats.hold import GL_FROM_CV, shift_before, write_hold
 from bigs.data.ground_truth import write_ground_truth
-from bigs.data.hold import GL_FROM_CV, shift_before, write_hold
 from bigs.data.synthetic.estimates import HandGuess, ObjectGuess, guess_hand, guess_object
 from bigs.data.synthetic.grasp import FINGERS, Grasp, HandLike, find_grasp, pose_hand, rest_joints
 from bigs.data.synthetic.motion import HandMotion, carry_hand, frame_camera, turn_object

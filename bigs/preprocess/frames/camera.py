@@ -10,9 +10,9 @@ import numpy as np
 
 from bigs.checks import InputError, found_at
 from bigs.colmap import pycolmap
-from bigs.data.arctic import camera_of_images
-from bigs.data.colmap_files import check_model_files
-from bigs.data.fields import LARGEST, array_field
+from bigs.data.entries import LARGEST, array_entry
+from bigs.data.formats.arctic import camera_of_images
+from bigs.data.formats.colmap_files import check_model_files
 from bigs.preprocess.frames.source import Source
 
 # Without any information the focal length is assumed to be this many times the longer side (46 degrees
@@ -115,7 +115,7 @@ def _from_colmap(folder: Path, width: int, height: int) -> Camera:
     if not cameras:
         raise InputError(f"{folder}: expected a COLMAP model with a camera, found none in it")
     camera = cameras[min(cameras)]
-    K = array_field(f"{folder}: camera", camera.calibration_matrix(), (3, 3))
+    K = array_entry(f"{folder}: camera", camera.calibration_matrix(), (3, 3))
     if min(camera.width, camera.height) < 1 or min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(
             f"{folder}: camera: expected a size and positive focal lengths, found {camera.width} x "

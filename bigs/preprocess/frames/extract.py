@@ -11,10 +11,11 @@ from PIL import Image
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError
-from bigs.data.arctic import meta_of_images
-from bigs.preprocess.artefacts import FRAMES, FRAMES_FILE, FrameSet, content_digest, write_frame_set
+from bigs.data.formats.arctic import meta_of_images
+from bigs.preprocess.artefacts import FRAMES, FRAMES_FILE, FrameSet, write_frame_set
 from bigs.preprocess.frames.camera import CameraRequest, find_camera, scale_camera
 from bigs.preprocess.frames.source import Source
+from bigs.preprocess.stamps import content_digest
 
 # Sharpness is compared on pictures of about this width, since finer grain is noise.
 _COMPARED_WIDTH = 480

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.archives import read_npz
 from bigs.checks import InputError, check_shape, shown
-from bigs.data.fields import array_field, flat_field, mapping_field, number_field, require
+from bigs.data.entries import array_entry, flat_entry, mapping_entry, number_entry, require
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.frames.matching import match_count, match_names
 from bigs.types import SIDES, Side
@@ -117,7 +117,7 @@ def _load(file: Path) -> Mapping[str, Any]:
         raise InputError(f"{file}: expected a file of hand estimates (.npy or .npz), found nothing")
     if file.suffix == ".npz":
         return read_npz(file, "an .npz of hand estimates")
-    return mapping_field(str(file), load_npy(file))
+    return mapping_entry(str(file), load_npy(file))
 
 
 def _frames_of(file: Path, stored: Mapping[str, Any], count: int, frames: FrameSet) -> list[int | None]:
@@ -139,7 +139,7 @@ def _assumed(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> np.ndar
     if "K" not in stored:
         return hamer_camera(frames.width, frames.height)
     width, height = frames.source_size if all(frames.source_size) else (frames.width, frames.height)
-    K = array_field(f"{file}: K", stored["K"], (3, 3))
+    K = array_entry(f"{file}: K", stored["K"], (3, 3))
     return np.diag([frames.width / width, frames.height / height, 1.0]) @ K
 
 
@@ -148,13 +148,13 @@ def _read_geometry(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> d
     for side in SIDES:
         if f"j3d.{side}" not in stored:
             continue
-        joints = array_field(f"{file}: j3d.{side}", stored[f"j3d.{side}"], ("T", 21, 3), finite=False)
+        joints = array_entry(f"{file}: j3d.{side}", stored[f"j3d.{side}"], ("T", 21, 3), finite=False)
         places = _frames_of(file, stored, len(joints), frames)
         joints = _rows(joints, places)
         valid = np.isfinite(joints).all((1, 2))
         vertices = None
         if f"v3d.{side}" in stored:
-            vertices = array_field(f"{file}: v3d.{side}", stored[f"v3d.{side}"], ("T", "V", 3), finite=False)
+            vertices = array_entry(f"{file}: v3d.{side}", stored[f"v3d.{side}"], ("T", "V", 3), finite=False)
             vertices = np.nan_to_num(_rows(vertices, places))
         if valid.any():
             found[side] = GeometryDump(np.nan_to_num(joints), vertices, valid, _assumed(file, stored, frames))
@@ -169,10 +169,10 @@ def _read_fit(
         if side not in stored:
             continue
         where = f"{file}: {side}"
-        entity = mapping_field(where, stored[side])
+        entity = mapping_entry(where, stored[side])
 
         def field(key: str, width: int, where: str = where, entity: Mapping[str, Any] = entity) -> np.ndarray:
-            return array_field(
+            return array_entry(
                 f"{where}.{key}", require(f"{where}.{key}", entity, key), ("T", width), finite=False
             )
 
@@ -184,7 +184,7 @@ def _read_fit(
         }
         valid = np.all([np.isfinite(rows).all(1) for rows in values.values()], axis=0)
         if "is_valid" in entity:
-            flags = array_field(f"{where}.is_valid", entity["is_valid"], (count,))
+            flags = array_entry(f"{where}.is_valid", entity["is_valid"], (count,))
             valid &= _rows(flags[:, None], places)[:, 0] == 1
         if not valid.any():
             continue
@@ -198,11 +198,11 @@ def _read_fit(
 
 
 def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> dict[Side, Dump]:
-    right = flat_field(f"{file}: right", stored["right"]) > 0.5
+    right = flat_entry(f"{file}: right", stored["right"]) > 0.5
     count = len(right)
 
     def field(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        values = flat_field(f"{file}: {key}", require(f"{file}: {key}", stored, key))
+        values = flat_entry(f"{file}: {key}", require(f"{file}: {key}", stored, key))
         check_shape(f"{file}: {key}, without axes", values, (count * math.prod(shape),))
         return values.reshape(count, *shape)
 
@@ -226,11 +226,11 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
     else:
         transl = field("pred_cam_t_full", (3,))
         where = f"{file}: scaled_focal_length"
-        focal = number_field(where, require(where, stored, "scaled_focal_length"))
+        focal = number_entry(where, require(where, stored, "scaled_focal_length"))
         K = hamer_camera(width, height)
         K[0, 0] = K[1, 1] = focal
     # HaMeR's own output is the right hand of the mirrored crop; some wrappers mirror it back.
-    mirrored = flat_field(f"{file}: mirrored", stored.get("mirrored", "pred_cam" in stored))
+    mirrored = flat_entry(f"{file}: mirrored", stored.get("mirrored", "pred_cam" in stored))
     if mirrored.all():
         turns[~right] = turns[~right] * mirror[:, None] * mirror
     K = np.diag([frames.width / width, frames.height / height, 1.0]) @ K
@@ -249,7 +249,7 @@ def _read_detections(file: Path, stored: Mapping[str, Any], frames: FrameSet) ->
 
 def _as_matrices(file: Path, stored: Mapping[str, Any], key: str, count: int, joints: int) -> np.ndarray:
     """Rotations [N, J, 3, 3] of matrices or axis-angle."""
-    values = flat_field(f"{file}: {key}", require(f"{file}: {key}", stored, key))
+    values = flat_entry(f"{file}: {key}", require(f"{file}: {key}", stored, key))
     if values.size == count * joints * 9:
         return values.reshape(count, joints, 3, 3)
     if values.size == count * joints * 3:
@@ -275,7 +275,7 @@ def _detection_frames(file: Path, stored: Mapping[str, Any], count: int, frames:
     if not any(isinstance(name, str) for name in listed):
         numbers = frames.source_frames or tuple(range(len(frames.names)))
         places = {str(number): t for t, number in enumerate(numbers)}
-        keys = [str(int(value)) for value in flat_field(f"{file}: frame", listed)]
+        keys = [str(int(value)) for value in flat_entry(f"{file}: frame", listed)]
     else:
         keys = [PurePath(str(value)).stem for value in listed]
     at = np.array([places.get(key, -1) for key in keys])

@@ -21,7 +21,7 @@ import numpy as np
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_choice
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.entries import array_entry, mapping_entry, require
 from bigs.files import read_json
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.frames.matching import match_count, match_names
@@ -93,14 +93,14 @@ def write_keypoints(file: Path, keypoints: Mapping[Side, Keypoints], frames: Fra
 
 
 def _read(file: Path) -> Mapping[str, Any]:
-    return mapping_field(str(file), read_json(file, "a keypoint file"))
+    return mapping_entry(str(file), read_json(file, "a keypoint file"))
 
 
 def frame_pixels(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> tuple[np.ndarray, float]:
     """The factor [2] and the shift that carry the file's coordinates to the frames' pixels."""
 
     def number(key: str, default: float) -> float:
-        return float(array_field(f"{file}: {key}", stored.get(key, default), ()))
+        return float(array_entry(f"{file}: {key}", stored.get(key, default), ()))
 
     width, height = frames.source_size if all(frames.source_size) else (frames.width, frames.height)
     size = np.array([number("width", width), number("height", height)])
@@ -117,7 +117,7 @@ def frame_pixels(file: Path, stored: Mapping[str, Any], frames: FrameSet) -> tup
 
 def _hand(where: str, entry: Any, side: Side) -> np.ndarray:
     """One hand [21, 3] in the file's order; zeros where there is none."""
-    points = mapping_field(where, entry).get(side)
+    points = mapping_entry(where, entry).get(side)
     if points is None or (isinstance(points, list) and not points):
         return np.zeros((JOINTS, 3))
     rows = [[0.0, 0.0, 0.0] if row is None else row for row in points] if isinstance(points, list) else points
@@ -129,6 +129,6 @@ def _hand(where: str, entry: Any, side: Side) -> np.ndarray:
         ) from None
     if table.shape == (JOINTS, 2):
         table = np.column_stack([table, np.ones(JOINTS)])
-    table = array_field(where, table, (JOINTS, 3), finite=False)
+    table = array_entry(where, table, (JOINTS, 3), finite=False)
     table[~np.isfinite(table).all(axis=1)] = 0.0
     return table

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from bigs.checks import InputError, check_choice
-from bigs.data.fields import array_field, mapping_field, require
+from bigs.data.entries import array_entry, mapping_entry, require
 from bigs.files import read_json
 from bigs.preprocess.artefacts import FrameSet
 from bigs.preprocess.hands.keypoints import Keypoints, frame_pixels
@@ -44,14 +44,14 @@ def read_clicks(file: Path, frames: FrameSet) -> dict[Entity, list[Click]]:
     Raises:
         InputError: unreadable, not in the documented layout, a frame that is not there, or a point outside.
     """
-    stored = mapping_field(str(file), read_json(file, "a file of clicks"))
+    stored = mapping_entry(str(file), read_json(file, "a file of clicks"))
     scale, _ = frame_pixels(file, stored, frames)
     found: dict[Entity, list[Click]] = {}
-    rows = mapping_field(f"{file}: frames", require(f"{file}: frames", stored, "frames"))
+    rows = mapping_entry(f"{file}: frames", require(f"{file}: frames", stored, "frames"))
     for name, entry in rows.items():
         where = f"{file}: frames.{name}"
         frame = _frame(where, name, frames)
-        for entity, prompt in mapping_field(where, entry).items():
+        for entity, prompt in mapping_entry(where, entry).items():
             check_choice(where, entity, ENTITIES)
             click = _click(f"{where}.{entity}", prompt, frame, scale, frames)
             found.setdefault(cast(Entity, entity), []).append(click)
@@ -104,19 +104,19 @@ def _frame(where: str, name: str, frames: FrameSet) -> int:
 
 
 def _click(where: str, prompt: Any, frame: int, scale: np.ndarray, frames: FrameSet) -> Click:
-    prompt = mapping_field(where, prompt)
+    prompt = mapping_entry(where, prompt)
     unknown = set(prompt) - {"points", "box"}
     if unknown or not prompt:
         raise InputError(f"{where}: expected points or box, found {', '.join(sorted(unknown)) or 'neither'}")
     table = np.zeros((0, 3))
     if prompt.get("points"):
-        table = array_field(f"{where}.points", prompt["points"], ("N", 3))
+        table = array_entry(f"{where}.points", prompt["points"], ("N", 3))
         if not np.isin(table[:, 2], (0, 1)).all():
             raise InputError(f"{where}.points: expected rows of x, y and 1 (on it) or 0 (not), found others")
     points = table[:, :2] * scale
     box = None
     if prompt.get("box") is not None:
-        box = array_field(f"{where}.box", prompt["box"], (4,)) * np.tile(scale, 2)
+        box = array_entry(f"{where}.box", prompt["box"], (4,)) * np.tile(scale, 2)
         if box[0] >= box[2] or box[1] >= box[3]:
             raise InputError(
                 f"{where}.box: expected x0 y0 x1 y1 with x0 < x1 and y0 < y1, found {box.tolist()}"

@@ -18,9 +18,10 @@ from PIL import Image
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, found_at
 from bigs.data.images import open_picture
-from bigs.preprocess.artefacts import MASKS, MASKS_FILE, FrameSet, write_json
+from bigs.preprocess.artefacts import MASKS, MASKS_FILE, FrameSet
 from bigs.preprocess.frames.matching import match_names
 from bigs.preprocess.frames.source import PICTURE_SUFFIXES, natural_order
+from bigs.preprocess.stamps import write_json
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 _FOLDER_NAMES: dict[Entity, tuple[str, ...]] = {

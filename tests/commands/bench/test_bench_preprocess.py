@@ -22,8 +22,8 @@ from bigs.commands.bench.variants import (
     write_variant,
 )
 from bigs.commands.preprocess.request import PreprocessRequest, StepOutcome
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.data.images import read_image, read_mask
 from bigs.preprocess.artefacts import Alignment
 from bigs.types import MASK_VALUES

@@ -18,7 +18,7 @@ from bigs.commands.bench.clip_damage import DAMAGES, ClipDamage, write_damaged
 from bigs.commands.bench.robustness import RobustnessPlan, bench_robustness
 from bigs.commands.evaluate.runs import Evaluation, EvaluationPlan
 from bigs.data.base import Clip
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, Side
 

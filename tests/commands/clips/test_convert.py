@@ -16,9 +16,9 @@ from bigs.commands.clips import convert as converting
 from bigs.commands.clips.convert import ConvertPlan, convert
 from bigs.commands.clips.truth import load_truth, pose_annotation
 from bigs.data.base import Clip
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.writers import write_arctic
 from bigs.data.ground_truth import load_annotation
-from bigs.data.hold import load_hold
-from bigs.data.writers import write_arctic
 from bigs.hand import HandModel
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
 from bigs.commands.clips.truth import load_truth, pose_annotation
-from bigs.data.annotation import Annotation
-from bigs.data.arctic import find_arctic, read_arctic
 from bigs.data.base import Clip
+from bigs.data.formats.annotation import Annotation
+from bigs.data.formats.arctic import find_arctic, read_arctic
+from bigs.data.formats.ho3d import CV_FROM_GL
+from bigs.data.formats.writers import write_arctic, write_ho3d
 from bigs.data.ground_truth import load_annotation
-from bigs.data.ho3d import CV_FROM_GL
 from bigs.data.moving import in_world
-from bigs.data.writers import write_arctic, write_ho3d
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import SIDES, HandObjectTrajectory, Side
 from bigs.unpickle import load_npy, restricted_load

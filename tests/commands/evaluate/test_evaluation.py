@@ -20,10 +20,10 @@ from bigs.commands.evaluate.picture_scores import novel_scores
 from bigs.commands.evaluate.runs import Evaluation, EvaluationPlan, compare_runs, evaluate_run
 from bigs.commands.render.frame import render_frame
 from bigs.data.base import Clip
+from bigs.data.formats.ho3d import CV_FROM_GL
+from bigs.data.formats.writers import write_arctic, write_ho3d
 from bigs.data.ground_truth import load_annotation
-from bigs.data.ho3d import CV_FROM_GL
 from bigs.data.moving import in_world
-from bigs.data.writers import write_arctic, write_ho3d
 from bigs.hand import HandModel
 from bigs.metrics.picture import ALL_METRICS
 from bigs.models.playback_file import load_playback

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.commands.export.formats import Choice, write_format
 from bigs.commands.folder.contents import load_run
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.hand import HandModel
 from bigs.models.playback import Playback

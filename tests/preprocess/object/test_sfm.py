@@ -12,7 +12,7 @@ from filmed_egg import film
 from turning_object import K, rotation_errors, turning_object
 
 from bigs.checks import InputError
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 from bigs.data.synthetic import make_clip
 from bigs.hand import load_hand_models
 from bigs.motion.features import FrameFeatures

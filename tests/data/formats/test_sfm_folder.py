@@ -18,11 +18,11 @@ from PIL import Image
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
-from bigs.data.colmap_files import check_model_files
-from bigs.data.layouts import layout_of, load_clip
+from bigs.data.formats.colmap_files import check_model_files
+from bigs.data.formats.layouts import layout_of, load_clip
+from bigs.data.formats.sfm_folder import load_sfm_folder
+from bigs.data.formats.writers import write_colmap, write_nerfstudio
 from bigs.data.moving import move_hand, move_object
-from bigs.data.sfm_folder import load_sfm_folder
-from bigs.data.writers import write_colmap, write_nerfstudio
 from bigs.hand import HandModel
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side

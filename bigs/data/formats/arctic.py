@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, check_pixels, check_product
-from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
-from bigs.data.fields import array_field, flat_field, mapping_field, require
+from bigs.data.entries import array_entry, flat_entry, mapping_entry, require
+from bigs.data.formats.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import LONGEST_M, check_solid, read_mesh
 from bigs.data.optics import Optics
@@ -134,11 +134,11 @@ def read_arctic(view: ArcticView, frame_names: Sequence[str]) -> Annotation:
     where, meta = _subject_meta(view)
     width, height = _image_size(where, meta, view.view)
     hands_file = view.raw("mano")
-    stored = mapping_field(str(hands_file), load_npy(hands_file))
+    stored = mapping_entry(str(hands_file), load_npy(hands_file))
     where_hands = {side: f"{hands_file}: {side}" for side in SIDES}
-    right = mapping_field(where_hands["right"], stored.get("right", {}))
+    right = mapping_entry(where_hands["right"], stored.get("right", {}))
     where_rows = f"{where_hands['right']}.rot"
-    n_rows = len(array_field(where_rows, require(where_rows, right, "rot"), ("T", 3)))
+    n_rows = len(array_entry(where_rows, require(where_rows, right, "rot"), ("T", 3)))
     rows, offset = _rows(view, frame_names)
     valid = (rows >= 0) & (rows < n_rows)
     if not valid.any():
@@ -194,7 +194,7 @@ def camera_of_images(folder: Path) -> tuple[np.ndarray, tuple[int, int]] | None:
 def _image_size(where: str, meta: Mapping[str, Any], view: int) -> tuple[int, int]:
     """Width and height of a view's whole pictures."""
     where = f"{where}.image_size"
-    size = array_field(where, require(where, meta, "image_size"), (9, 2))[view]
+    size = array_entry(where, require(where, meta, "image_size"), (9, 2))[view]
     if size.min() < 1 or (size != np.floor(size)).any():
         raise InputError(f"{where}: expected widths and heights in pixels, found {size.tolist()}")
     width, height = map(int, size)
@@ -203,21 +203,21 @@ def _image_size(where: str, meta: Mapping[str, Any], view: int) -> tuple[int, in
 
 
 def _intrinsics(where: str, meta: Mapping[str, Any]) -> np.ndarray:
-    return array_field(f"{where}.intris_mat", require(f"{where}.intris_mat", meta, "intris_mat"), (8, 3, 3))
+    return array_entry(f"{where}.intris_mat", require(f"{where}.intris_mat", meta, "intris_mat"), (8, 3, 3))
 
 
 def _subject_meta(view: ArcticView) -> tuple[str, Mapping[str, Any]]:
     """The subject's entry of misc.json, and its name in messages."""
     file = view.root / "meta" / "misc.json"
     where = f"{file}: {view.subject}"
-    meta = mapping_field(str(file), read_json(file))
-    return where, mapping_field(where, require(where, meta, view.subject))
+    meta = mapping_entry(str(file), read_json(file))
+    return where, mapping_entry(where, require(where, meta, view.subject))
 
 
 def _rows(view: ArcticView, frame_names: Sequence[str]) -> tuple[np.ndarray, int]:
     """The annotation row of each image [T], which may not exist, and the number of the image of row 0."""
     where, meta = _subject_meta(view)
-    offset = int(array_field(f"{where}.ioi_offset", require(f"{where}.ioi_offset", meta, "ioi_offset"), ()))
+    offset = int(array_entry(f"{where}.ioi_offset", require(f"{where}.ioi_offset", meta, "ioi_offset"), ()))
     return np.array([_frame_number(view, name) for name in frame_names]) - offset, offset
 
 
@@ -235,15 +235,15 @@ def _camera(
     if view.view == 0:
         return _egocentric_camera(view.raw("egocam.dist"), rows)
     intrinsics = _intrinsics(where, meta)
-    world2cam = array_field(f"{where}.world2cam", require(f"{where}.world2cam", meta, "world2cam"), (8, 4, 4))
+    world2cam = array_entry(f"{where}.world2cam", require(f"{where}.world2cam", meta, "world2cam"), (8, 4, 4))
     return intrinsics[view.view - 1], np.repeat(world2cam[view.view - 1][None], len(rows), axis=0)
 
 
 def _egocentric_camera(file: Path, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    stored = mapping_field(str(file), load_npy(file))
+    stored = mapping_entry(str(file), load_npy(file))
 
     def field(key: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        return array_field(f"{file}: {key}", require(f"{file}: {key}", stored, key), shape)
+        return array_entry(f"{file}: {key}", require(f"{file}: {key}", stored, key), shape)
 
     cam_from_world = np.repeat(np.eye(4)[None], len(rows), axis=0)
     cam_from_world[:, :3, :3] = field("R_k_cam_np", ("T", 3, 3))[rows]
@@ -258,8 +258,8 @@ def _optics(view: ArcticView, annotation: Annotation, image_paths: Sequence[Path
     distortion = np.zeros(8)
     if view.view == 0:
         file = view.raw("egocam.dist")
-        stored = mapping_field(str(file), load_npy(file))
-        distortion = array_field(f"{file}: dist8", stored.get("dist8", distortion), (8,))
+        stored = mapping_entry(str(file), load_npy(file))
+        distortion = array_entry(f"{file}: dist8", stored.get("dist8", distortion), (8,))
     is_cropped = image_paths[0].is_relative_to(view.root / "cropped_images")
     boxes = np.repeat([[0.0, 0.0, *map(float, size)]], len(image_paths), axis=0)
     if not is_cropped or (width, height) == size:
@@ -279,8 +279,8 @@ def _crop_boxes(view: ArcticView, frame_names: Sequence[str]) -> np.ndarray:
             f"{view.frames_in('images')}: expected the whole images, or in {places[0]} the boxes of the "
             "cropped ones, found only cropped_images"
         )
-    stored = mapping_field(str(file), load_npy(file))
-    boxes = array_field(f"{file}: bbox", require(f"{file}: bbox", stored, "bbox"), ("T", 9, 3))
+    stored = mapping_entry(str(file), load_npy(file))
+    boxes = array_entry(f"{file}: bbox", require(f"{file}: bbox", stored, "bbox"), ("T", 9, 3))
     rows, _ = _rows(view, frame_names)
     center_x, center_y, scale = boxes[np.clip(rows, 0, len(boxes) - 1), view.view].T
     half = 0.5 * _CROP_FACTOR * _BOX_PIXELS * scale
@@ -288,13 +288,13 @@ def _crop_boxes(view: ArcticView, frame_names: Sequence[str]) -> np.ndarray:
 
 
 def _read_hand(where: str, stored: Any, n_rows: int, rows: np.ndarray, valid: np.ndarray) -> HandTrack:
-    stored = mapping_field(where, stored)
+    stored = mapping_entry(where, stored)
 
     def field(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        return array_field(f"{where}.{key}", require(f"{where}.{key}", stored, key), shape)
+        return array_entry(f"{where}.{key}", require(f"{where}.{key}", stored, key), shape)
 
     # One shape for all frames; the documentation shows it repeated in every frame.
-    shapes = flat_field(f"{where}.shape", require(f"{where}.shape", stored, "shape"))
+    shapes = flat_entry(f"{where}.shape", require(f"{where}.shape", stored, "shape"))
     betas = field("shape", (n_rows, 10))[0] if len(shapes) != 10 else shapes
     return HandTrack(
         global_orient=field("rot", (n_rows, 3))[rows],
@@ -317,7 +317,7 @@ def _read_object(view: ArcticView, n_rows: int, rows: np.ndarray, valid: np.ndar
     check_solid(str(folder / "mesh.obj"), verts, faces)
     check_product(str(folder / "mesh.obj"), len(rows), len(verts))
     file = view.raw("object")
-    poses = array_field(str(file), load_npy(file), (n_rows, 7))[rows]
+    poses = array_entry(str(file), load_npy(file), (n_rows, 7))[rows]
     check_turns(str(file), poses[:, 1:4], valid)
     angles = poses[:, 0]
     if angles.any():
@@ -343,12 +343,12 @@ def _top_vertices(folder: Path, n_verts: int) -> np.ndarray:
     decide where they are given, else the code.
     """
     parts_file, boxes_file = folder / "parts.json", folder / "object_params.json"
-    parts = array_field(str(parts_file), read_json(parts_file), (n_verts,))
+    parts = array_entry(str(parts_file), read_json(parts_file), (n_verts,))
     top = 0
     if boxes_file.is_file() and len(np.unique(parts)) == 2:
-        boxes = mapping_field(str(boxes_file), read_json(boxes_file))
+        boxes = mapping_entry(str(boxes_file), read_json(boxes_file))
         corners = {
-            part: array_field(f"{boxes_file}: bbox_{part}", boxes.get(f"bbox_{part}", []), (8, 3))
+            part: array_entry(f"{boxes_file}: bbox_{part}", boxes.get(f"bbox_{part}", []), (8, 3))
             for part in ("top", "bottom")
         }
         verts, _ = read_mesh(folder / "mesh.obj")

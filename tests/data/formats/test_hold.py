@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from small_clip import FRAMES, HEIGHT, SHIFT, WIDTH, K, random_hand, random_object, small_masks
 
 from bigs.data.base import Clip
+from bigs.data.formats.hold import load_hold
 from bigs.data.ground_truth import load_ground_truth
-from bigs.data.hold import load_hold
 from bigs.data.synthetic.raycast import Body, take_picture
 from bigs.hand import load_hand_models
 from bigs.types import MASK_VALUES

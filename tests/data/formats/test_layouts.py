@@ -13,11 +13,11 @@ from PIL import Image
 from small_clip import FRAMES, HEIGHT, WIDTH, small_annotation, small_masks
 
 from bigs.checks import InputError
-from bigs.data.annotation import Annotation
-from bigs.data.arctic import find_arctic, load_arctic
-from bigs.data.ho3d import CV_FROM_GL, load_ho3d
-from bigs.data.layouts import layout_of, load_clip
-from bigs.data.writers import write_arctic, write_ho3d
+from bigs.data.formats.annotation import Annotation
+from bigs.data.formats.arctic import find_arctic, load_arctic
+from bigs.data.formats.ho3d import CV_FROM_GL, load_ho3d
+from bigs.data.formats.layouts import layout_of, load_clip
+from bigs.data.formats.writers import write_arctic, write_ho3d
 from bigs.unpickle import load_npy
 
 NO_MEAN = np.zeros((15, 3))

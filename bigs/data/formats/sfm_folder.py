@@ -27,9 +27,10 @@ from bigs.archives import read_npz
 from bigs.checks import InputError, check_finite, check_rotations, shown
 from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.colmap_files import check_model_files
-from bigs.data.fields import array_field, mapping_field, number_field, require
-from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
+from bigs.data.entries import array_entry, mapping_entry, number_entry, require
+from bigs.data.formats.colmap_files import check_model_files
+from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
+from bigs.data.formats.transforms import read_cameras
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -40,7 +41,6 @@ from bigs.data.images import (
 )
 from bigs.data.mesh_files import load_mesh_file
 from bigs.data.tracks import fill_rotations, fill_vectors
-from bigs.data.transforms import read_cameras
 from bigs.files import read_json
 from bigs.names import check_inside, check_name
 from bigs.types import SIDES, Side
@@ -134,7 +134,7 @@ def _read_transforms(folder: Path, size: tuple[int, int]) -> SfmModel | None:
             raise InputError(f"{camera.where}: expected the first frame's lens, found another")
         name = require(f"{camera.where}.file_path", camera.entry, "file_path")
         poses[Path(str(name)).stem] = camera.viewmat
-    document = mapping_field(str(file), read_json(file))
+    document = mapping_entry(str(file), read_json(file))
     where = f"{file}: ply_file_path"
     points, colors = _read_points(folder / check_inside(where, require(where, document, "ply_file_path")))
     return SfmModel(cameras[0].K, poses, points, colors)
@@ -142,7 +142,7 @@ def _read_transforms(folder: Path, size: tuple[int, int]) -> SfmModel | None:
 
 def _read_points(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
     cloud = load_mesh_file(file, "the model's points", trimesh.load)
-    points = array_field(f"{file}: points", getattr(cloud, "vertices", None), ("N", 3))
+    points = array_entry(f"{file}: points", getattr(cloud, "vertices", None), ("N", 3))
     colors = np.asarray(getattr(cloud, "colors", np.zeros((0, 4))))
     return points, colors[:, :3] / 255.0 if len(colors) == len(points) else None
 
@@ -178,7 +178,7 @@ def _read_colmap(folder: Path, size: tuple[int, int]) -> SfmModel:
         )
         check_rotations(f"{place}: pose of image {shown(image.name)}", poses[Path(image.name).stem][:3, :3])
         check_finite(f"{place}: pose of image {shown(image.name)}", poses[Path(image.name).stem])
-    K = array_field(f"{place}: camera", camera.calibration_matrix(), (3, 3))
+    K = array_entry(f"{place}: camera", camera.calibration_matrix(), (3, 3))
     _check_lens(f"{place}: camera", K, size)
     points = list(model.points3D.values())
     return SfmModel(
@@ -210,7 +210,7 @@ def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float |
         raise InputError(f"{file}: expected right_transl or left_transl, found {', '.join(arrays)}")
     if "object_scale" not in arrays:
         return hands, None
-    scale = number_field(f"{file}: object_scale", arrays["object_scale"])
+    scale = number_entry(f"{file}: object_scale", arrays["object_scale"])
     if scale <= 0:
         raise InputError(f"{file}: object_scale: expected a positive number, found {scale:g}")
     return hands, scale
@@ -219,7 +219,7 @@ def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float |
 def _read_hand(file: Path, arrays: Mapping[str, np.ndarray], side: Side, frames: int) -> HandTrack:
     def field(key: str, shape: tuple[int, ...], *, finite: bool = True) -> np.ndarray:
         name = f"{side}_{key}"
-        return array_field(f"{file}: {name}", require(f"{file}: {name}", arrays, name), shape, finite=finite)
+        return array_entry(f"{file}: {name}", require(f"{file}: {name}", arrays, name), shape, finite=finite)
 
     valid = np.ones(frames, dtype=bool)
     if f"{side}_valid" in arrays:
@@ -254,7 +254,7 @@ def _object_track(
     scale: float | None,
 ) -> ObjectTrack:
     valid = np.array([stem in model.poses for stem in stems])
-    points = array_field(f"{folder}: points of the model", model.points, ("N", 3))
+    points = array_entry(f"{folder}: points of the model", model.points, ("N", 3))
     if not valid.any():
         raise InputError(
             f"{folder}: expected a model with the images {stems[0]} ..., found none of them in it"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bigs.checks import InputError, check_pixels, shown
-from bigs.data.fields import array_field, mapping_field, number_field, require
+from bigs.data.entries import array_entry, mapping_entry, number_entry, require
 from bigs.files import read_json
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -56,7 +56,7 @@ def read_cameras(path: str | Path) -> list[PlacedCamera]:
         InputError: not JSON, a missing field, distortion, or a matrix that is not rigid.
     """
     path = Path(path)
-    return cameras_in(path, mapping_field(str(path), read_json(path)))
+    return cameras_in(path, mapping_entry(str(path), read_json(path)))
 
 
 def cameras_in(
@@ -74,7 +74,7 @@ def cameras_in(
     cameras = []
     for index, stored in enumerate(frames):
         where = f"{path}: frames[{index}]"
-        entry = mapping_field(where, stored)
+        entry = mapping_entry(where, stored)
         # A frame's own lens overrides the file's.
         values = {**document, **entry}
         _check_lens(where, values)
@@ -112,7 +112,7 @@ def _check_lens(where: str, values: Mapping[str, Any]) -> None:
             f"{where}.camera_model: expected one of {', '.join(_PINHOLE_MODELS)}, found {model!r}"
         )
     for key in _DISTORTION:
-        if key in values and number_field(f"{where}.{key}", values[key]) != 0:
+        if key in values and number_entry(f"{where}.{key}", values[key]) != 0:
             raise InputError(f"{where}.{key}: expected a camera without distortion, found {values[key]}")
 
 
@@ -121,20 +121,20 @@ def _intrinsics(where: str, values: Mapping[str, Any], width: int, height: int) 
     if fl_x is None:
         raise InputError(f"{where}.fl_x: expected fl_x or camera_angle_x, found neither")
     fl_y = _focal(where, values, "fl_y", "camera_angle_y", height)
-    cx = number_field(f"{where}.cx", values.get("cx", width / 2))
-    cy = number_field(f"{where}.cy", values.get("cy", height / 2))
+    cx = number_entry(f"{where}.cx", values.get("cx", width / 2))
+    cy = number_entry(f"{where}.cy", values.get("cy", height / 2))
     return np.array([[fl_x, 0.0, cx], [0.0, fl_x if fl_y is None else fl_y, cy], [0.0, 0.0, 1.0]])
 
 
 def _focal(where: str, values: Mapping[str, Any], key: str, angle_key: str, pixels: int) -> float | None:
     """The focal length in pixels, from itself or from the field of view; None if the file gives neither."""
     if key in values:
-        focal = number_field(f"{where}.{key}", values[key])
+        focal = number_entry(f"{where}.{key}", values[key])
         if focal <= 0:
             raise InputError(f"{where}.{key}: expected a positive focal length, found {focal:g}")
         return focal
     if angle_key in values:
-        angle = number_field(f"{where}.{angle_key}", values[angle_key])
+        angle = number_entry(f"{where}.{angle_key}", values[angle_key])
         if not 0 < angle < math.pi:
             raise InputError(f"{where}.{angle_key}: expected an angle between 0 and pi, found {angle:g}")
         return 0.5 * pixels / math.tan(0.5 * angle)
@@ -164,7 +164,7 @@ def viewmat_field(where: str, stored: Any) -> np.ndarray:
         matrix = np.asarray(stored)
     except ValueError:  # rows of different lengths
         raise InputError(f"{where}: expected a 4 x 4 matrix, found {shown(stored)}") from None
-    world_from_gl = array_field(where, matrix, (4, 4))
+    world_from_gl = array_entry(where, matrix, (4, 4))
     rotation = world_from_gl[:3, :3]
     is_rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID_TOLERANCE)
     if not is_rigid or np.linalg.det(rotation) < 0 or not np.allclose(world_from_gl[3], [0, 0, 0, 1]):
@@ -174,7 +174,7 @@ def viewmat_field(where: str, stored: Any) -> np.ndarray:
 
 def count_field(where: str, values: Mapping[str, Any], key: str, least: int) -> int:
     """A whole number of at least `least`; instant-ngp writes sizes as 1080.0."""
-    number = number_field(where, require(where, values, key))
+    number = number_entry(where, require(where, values, key))
     if number != int(number) or number < least:
         raise InputError(f"{where}: expected a whole number of at least {least}, found {number:g}")
     return int(number)

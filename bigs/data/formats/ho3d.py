@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, check_product, check_shape
-from bigs.data.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.base import Clip, HandTrack
-from bigs.data.fields import flat_field, mapping_field, require
+from bigs.data.entries import flat_entry, mapping_entry, require
+from bigs.data.formats.annotation import Annotation, ObjectTruth, annotated_clip
 from bigs.data.images import IMAGE_SUFFIXES, MASK_SUFFIXES, check_pairs, list_frames, read_image
 from bigs.data.meshes import check_solid, read_mesh
 from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
@@ -138,7 +138,7 @@ def read_ho3d(
 
 def _read_meta(file: Path) -> Mapping[str, Any]:
     with open_regular(file, "the annotation of a frame") as stream:
-        return mapping_field(str(file), restricted_load(stream, name=str(file)))
+        return mapping_entry(str(file), restricted_load(stream, name=str(file)))
 
 
 def _camera(files: Sequence[Path], metas: Sequence[Mapping[str, Any]], valid: np.ndarray) -> np.ndarray:
@@ -211,6 +211,6 @@ def _column(
 
 def _numbers(file: Path, meta: Mapping[str, Any], key: str, count: int) -> np.ndarray:
     """A field [count]; rows and columns are the same here, as some frames hold [3, 1] for [3]."""
-    values = flat_field(f"{file}: {key}", require(f"{file}: {key}", meta, key))
+    values = flat_entry(f"{file}: {key}", require(f"{file}: {key}", meta, key))
     check_shape(f"{file}: {key}", values, (count,))
     return values

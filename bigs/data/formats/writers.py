@@ -14,10 +14,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError
-from bigs.data.annotation import Annotation, ObjectTruth
-from bigs.data.arctic import DEFAULT_VIEW, MM_PER_M, ArcticView
 from bigs.data.base import Clip
-from bigs.data.ho3d import CV_FROM_GL, SPLITS
+from bigs.data.formats.annotation import Annotation, ObjectTruth
+from bigs.data.formats.arctic import DEFAULT_VIEW, MM_PER_M, ArcticView
+from bigs.data.formats.ho3d import CV_FROM_GL, SPLITS
 from bigs.files import read_json
 from bigs.names import check_name
 
@@ -144,7 +144,7 @@ def write_ho3d(
 def write_colmap(folder: str | Path, clip: Clip) -> Path:
     """Write a clip with estimates as a COLMAP model in text form, with frames, masks and hands.npz beside.
 
-    See `bigs.data.sfm_folder` for the files. The model's unit is that of the clip's structure from motion.
+    See `sfm_folder` for the files. The model's unit is that of the clip's structure from motion.
 
     Args:
         folder: where to; made if missing.

@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 
 from bigs.checks import InputError
-from bigs.data.colmap_files import check_model_files
+from bigs.data.formats.colmap_files import check_model_files
 
 
 def count(number: int) -> bytes:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, found_at
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.fields import array_field, mapping_field, number_field, require
+from bigs.data.entries import array_entry, mapping_entry, number_entry, require
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -63,7 +63,7 @@ def load_hold(path: str | Path) -> Clip:
     frame_names = _frame_names(folder / "corres.txt", image_paths)
     check_pairs(image_paths, mask_paths)
 
-    data = mapping_field(str(file), load_npy(file))
+    data = mapping_entry(str(file), load_npy(file))
     name = data.get("seq_name")
     nameless = name is None or (isinstance(name, str) and not name)
     name = check_name(f"{file}: seq_name", _sequence_name(folder) if nameless else name)
@@ -71,7 +71,7 @@ def load_hold(path: str | Path) -> Clip:
     height, width = read_image(image_paths[0]).shape[:2]
     K, cam_from_world, scene_scale = _read_cameras(file, data, frames, width)
     where = f"{file}: entities"
-    entities = mapping_field(where, require(where, data, "entities"))
+    entities = mapping_entry(where, require(where, data, "entities"))
     hands: dict[Side, HandTrack] = {
         side: _read_hand(f"{where}.{side}", entities[side], frames) for side in SIDES if side in entities
     }
@@ -80,7 +80,7 @@ def load_hold(path: str | Path) -> Clip:
         found = ", ".join(map(str, entities)) or "none"
         raise InputError(f"{where}: expected at least one of {', '.join(ENTITIES)}, found {found}")
     where = f"{file}: normalize_shift"
-    normalize_shift = array_field(where, require(where, data, "normalize_shift"), (3,))
+    normalize_shift = array_entry(where, require(where, data, "normalize_shift"), (3,))
 
     return Clip(
         name=name,
@@ -198,7 +198,7 @@ def _read_cameras(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """K [3, 3], cam_from_world [T, 4, 4] and HOLD's scene scale from `world_mat_i` and `scale_mat_i`."""
     where = f"{file}: cameras"
-    cameras = mapping_field(where, require(where, data, "cameras"))
+    cameras = mapping_entry(where, require(where, data, "cameras"))
     stored = sum(1 for key in cameras if re.fullmatch(r"world_mat_\d+", str(key)))
     if stored != frames:
         raise InputError(f"{where}: expected a world_mat for each of {frames} images, found {stored}")
@@ -206,7 +206,7 @@ def _read_cameras(
     extrinsics: list[np.ndarray] = []
     for t in range(frames):
         matrix = f"{where}.world_mat_{t}"
-        world_mat = array_field(matrix, require(matrix, cameras, f"world_mat_{t}"), (4, 4))
+        world_mat = array_entry(matrix, require(matrix, cameras, f"world_mat_{t}"), (4, 4))
         K, cam_from_world = decompose_projection(matrix, world_mat, width)
         if t and not np.allclose(K, intrinsics[0], rtol=0, atol=CAMERA_TOLERANCE * width):
             expected, found = (np.array2string(k, precision=6).replace("\n", "") for k in (intrinsics[0], K))
@@ -215,7 +215,7 @@ def _read_cameras(
         extrinsics.append(cam_from_world)
 
     matrix = f"{where}.scale_mat_0"
-    scale_mat = array_field(matrix, require(matrix, cameras, "scale_mat_0"), (4, 4))
+    scale_mat = array_entry(matrix, require(matrix, cameras, "scale_mat_0"), (4, 4))
     radius = float(scale_mat[0, 0])
     if radius <= 0 or not np.allclose(scale_mat, np.diag([radius, radius, radius, 1.0])):
         raise InputError(f"{matrix}: expected diag(m, m, m, 1) with m > 0, found {scale_mat.tolist()}")
@@ -223,7 +223,7 @@ def _read_cameras(
 
 
 def _read_hand(where: str, entity: Any, frames: int) -> HandTrack:
-    entity = mapping_field(where, entity)
+    entity = mapping_entry(where, entity)
     valid = _read_valid(where, entity, frames)
     poses = _track(where, entity, "hand_poses", (frames, 48), valid)
     check_turns(f"{where}.hand_poses", poses.reshape(frames, 16, 3), valid)
@@ -238,7 +238,7 @@ def _read_hand(where: str, entity: Any, frames: int) -> HandTrack:
 
 
 def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
-    entity = mapping_field(where, entity)
+    entity = mapping_entry(where, entity)
     valid = _read_valid(where, entity, frames)
     poses = _track(where, entity, "object_poses", (frames, 6), valid)
     points = _entity_array(where, entity, "pts.cano", ("N", 3))
@@ -270,7 +270,7 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
 
 
 def _read_scale(where: str, stored: Any) -> float:
-    scale = number_field(where, stored)
+    scale = number_entry(where, stored)
     if scale <= 0:
         raise InputError(f"{where}: expected a positive number, found {scale:g}")
     return scale
@@ -279,7 +279,7 @@ def _read_scale(where: str, stored: Any) -> float:
 def _read_colors(where: str, stored: Any, count: int) -> np.ndarray:
     """Colours [N, 3] in [0, 1] from bytes or from numbers that are in [0, 1] already."""
     is_bytes = np.asarray(stored).dtype == np.uint8
-    colors = array_field(where, stored, (count, 3)) / (255.0 if is_bytes else 1.0)
+    colors = array_entry(where, stored, (count, 3)) / (255.0 if is_bytes else 1.0)
     if colors.min() < 0 or colors.max() > 1:
         raise InputError(
             f"{where}: expected uint8 or numbers in [0, 1], found {colors.min():.3g} to {colors.max():.3g}"
@@ -291,7 +291,7 @@ def _read_valid(where: str, entity: Mapping[str, Any], frames: int) -> np.ndarra
     """`is_valid` as bool [T]; every frame is valid when the file does not say."""
     if "is_valid" not in entity:
         return np.ones(frames, dtype=bool)
-    flags = array_field(f"{where}.is_valid", entity["is_valid"], (frames,))
+    flags = array_entry(f"{where}.is_valid", entity["is_valid"], (frames,))
     if not np.isin(flags, (0, 1)).all():
         raise InputError(
             f"{where}.is_valid: expected 0 or 1 in every frame, found {flags[~np.isin(flags, (0, 1))][0]}"
@@ -318,7 +318,7 @@ def _track(
 def _entity_array(
     where: str, entity: Mapping[str, Any], key: str, shape: Sequence[int | str], *, finite: bool = True
 ) -> np.ndarray:
-    return array_field(f"{where}.{key}", require(f"{where}.{key}", entity, key), shape, finite=finite)
+    return array_entry(f"{where}.{key}", require(f"{where}.{key}", entity, key), shape, finite=finite)
 
 
 def _hand_entity(track: HandTrack) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Fields of a foreign dictionary: present, of the right type and shape, finite.
+"""Entries of a foreign dictionary: present, of the right type and shape, finite.
 
-`where` is the text that names the field in a message: the file, then the path of keys, as in
+`where` is the text that names the entry in a message: the file, then the path of keys, as in
 `clip/build/data.npy: entities.right.hand_poses`.
 """
 
@@ -19,14 +19,14 @@ from bigs.checks import InputError, check_finite, check_shape, shown
 LARGEST = 1e15
 
 
-def mapping_field(where: str, value: Any) -> Mapping[str, Any]:
+def mapping_entry(where: str, value: Any) -> Mapping[str, Any]:
     """`value` if it is a dictionary, else an InputError."""
     if not isinstance(value, Mapping):
         raise InputError(f"{where}: expected a dictionary, found {type(value).__name__}")
     return value
 
 
-def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: bool = True) -> np.ndarray:
+def array_entry(where: str, value: Any, shape: Sequence[int | str], *, finite: bool = True) -> np.ndarray:
     """`value` (numpy or torch) as float64 of `shape`, finite unless told otherwise, else an InputError."""
     array = _numbers(where, value)
     check_shape(where, array, shape)
@@ -35,15 +35,15 @@ def array_field(where: str, value: Any, shape: Sequence[int | str], *, finite: b
     return array
 
 
-def flat_field(where: str, value: Any, *, finite: bool = True) -> np.ndarray:
-    """`value` as float64 without axes, [N], for fields whose writers disagree about theirs."""
+def flat_entry(where: str, value: Any, *, finite: bool = True) -> np.ndarray:
+    """`value` as float64 without axes, [N], for entries whose writers disagree about theirs."""
     array = _numbers(where, value).ravel()
     if finite:
         check_finite(where, array)
     return array
 
 
-def number_field(where: str, value: Any) -> float:
+def number_entry(where: str, value: Any) -> float:
     """`value` as a finite number, alone or in an array; a truth value is none. Else an InputError."""
     array = _numbers(where, value)
     dtype = value.dtype if isinstance(value, torch.Tensor) else np.asarray(value).dtype

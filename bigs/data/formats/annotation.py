@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.hold import RADIUS_PER_SHIFT, shift_before
+from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.images import decode_frames
 from bigs.data.optics import Optics
 from bigs.types import Side

@@ -13,7 +13,7 @@ from PIL import Image
 from small_clip import FRAMES, HEIGHT, WIDTH
 
 from bigs.checks import InputError
-from bigs.data.hold import load_hold
+from bigs.data.formats.hold import load_hold
 
 Change = Callable[[dict[str, Any]], Any]
 

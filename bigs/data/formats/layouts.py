@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 
 from bigs.checks import InputError, found_at
-from bigs.data.arctic import find_arctic, load_arctic
 from bigs.data.base import Clip
-from bigs.data.ho3d import find_ho3d, load_ho3d
-from bigs.data.hold import load_hold
-from bigs.data.sfm_folder import is_sfm_folder, load_sfm_folder
+from bigs.data.formats.arctic import find_arctic, load_arctic
+from bigs.data.formats.ho3d import find_ho3d, load_ho3d
+from bigs.data.formats.hold import load_hold
+from bigs.data.formats.sfm_folder import is_sfm_folder, load_sfm_folder
 
 Layout = Literal["hold", "arctic", "ho3d", "sfm"]
 LAYOUT_NAMES: dict[Layout, str] = {
