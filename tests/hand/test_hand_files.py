@@ -190,7 +190,7 @@ def test_a_left_hand_under_the_right_hands_name_is_noticed(tmp_path: Path, field
         ("text.npz", "archive of plain arrays"),
         ("text.pkl", "readable pickle"),
         ("text.txt", "suffix .npz or .pkl, found '.txt'"),
-        ("list.pkl", "dict of fields, found list"),
+        ("list.pkl", "dictionary of arrays, found list"),
         ("array.npz", "archive of plain arrays"),
         ("objects.npz", "archive of plain arrays"),
     ],
