@@ -27,7 +27,7 @@ RESULTS = ("scene.safetensors", "poses.npz", "gaussians/hand.ply", "meshes/objec
 STEPS = {
     "hands-coarse": 6,
     "hands-fine": 3,
-    "held": 3,
+    "grasped": 3,
     "appearance": 3,
     "contact": 3,
     "regrasp": 3,

@@ -101,7 +101,7 @@ class _Judge:
         same_way = (image.normals[near] * self.surface.normals[index[near]]).sum(-1) > _LEAST_COSINE
         return near[same_way], index[near[same_way]]
 
-    def evidence(self, symmetry: Symmetry) -> tuple[float, float, float]:
+    def agreement(self, symmetry: Symmetry) -> tuple[float, float, float]:
         """Support and contradiction as shares of what is carried; the colours' error relative to chance."""
         support, contradiction, errors = [], [], []
         for image in self.images(symmetry):
@@ -116,18 +116,18 @@ class _Judge:
         return float(np.mean(support)), float(np.mean(contradiction)), color
 
     def worth(self, symmetry: Symmetry) -> float:
-        support, contradiction, _ = self.evidence(symmetry)
+        support, contradiction, _ = self.agreement(symmetry)
         return support - 3.0 * contradiction
 
     def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
-        """The refined candidate with the strongest evidence; None if that is not enough."""
+        """The refined candidate that agrees best; None if that is not enough."""
         ranked = sorted(candidates, key=self.worth, reverse=True)[:_FINALISTS]
         refined: list[Symmetry] = []
         for symmetry in sorted(map(self._refined, ranked), key=self.worth, reverse=True):
             if not any(_alike(symmetry, other, self.size) for other in (*known, *refined)):
                 refined.append(symmetry)
         for symmetry in sorted(map(self._polished, refined[:_POLISHED]), key=self.worth, reverse=True):
-            support, contradiction, color = self.evidence(symmetry)
+            support, contradiction, color = self.agreement(symmetry)
             most = self.config.most_contradiction
             if (
                 not any(_alike(symmetry, other, self.size) for other in known)
@@ -168,7 +168,7 @@ class _Judge:
         return symmetry
 
     def _polished(self, symmetry: Symmetry) -> Symmetry:
-        """The symmetry moved a little to where its evidence is strongest."""
+        """The symmetry moved a little to where it agrees best."""
         simplex = np.vstack([np.zeros(4), np.diag([0.02, 0.02, 0.06, 0.06])])
         found = scipy.optimize.minimize(
             lambda x: -self.worth(symmetry.moved(x, self.size)),

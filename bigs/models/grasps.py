@@ -49,17 +49,17 @@ class Grasps(nn.Module):
     def count(self) -> int:
         return int(self.of_frame.max()) + 1
 
-    def held(self, frames: Tensor) -> Tensor:
+    def covers(self, frames: Tensor) -> Tensor:
         """Which of `frames` [B] belong to a grasp, [B] bool."""
         return self.of_frame[frames] >= 0
 
     def pose_residuals(self) -> Tensor:
         """Finger residuals [T, 15, 3] of every frame's grasp; zero where there is none."""
-        held = self.of_frame >= 0
-        return self.pose[self.of_frame.clamp_min(0)] * held[:, None, None]
+        grasped = self.of_frame >= 0
+        return self.pose[self.of_frame.clamp_min(0)] * grasped[:, None, None]
 
     def forward(self, frames: Tensor, object_frames: ObjectFrames) -> HandFrames:
-        """The hand's poses at `frames` [B] as the object carries it; meaningless where it is not held."""
+        """The hand's poses at `frames` [B] as the object carries it; meaningless outside grasps."""
         g = self.of_frame[frames].clamp_min(0)
         orient = axis_angle_to_matrix(self.orient[g]) @ self.base_orient[g]
         position = self.base_position[g] + self.position[g]

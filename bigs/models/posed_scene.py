@@ -119,15 +119,15 @@ class PosedScene:
 
     def _own_hand(self, side: Side) -> HandFrames:
         poses, grasps = self._scene.hand_poses[side], self._scene.grasps[side]
-        held = grasps.held(self.frames)
-        if not held.any():
+        grasped = grasps.covers(self.frames)
+        if not grasped.any():
             return poses(self.frames)
         carried, own = grasps(self.frames, self.object), poses.start(self.frames)
         start = (
-            torch.where(held.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            torch.where(grasped.reshape(-1, *[1] * (a.ndim - 1)), a, b)
             for a, b in zip(carried, own, strict=True)
         )
-        return poses(self.frames, HandFrames(*start), torch.where(held, grasps.slack, 1.0))
+        return poses(self.frames, HandFrames(*start), torch.where(grasped, grasps.slack, 1.0))
 
     def _skeleton(self, side: Side) -> Skeleton:
         """The canonical hand's bones."""

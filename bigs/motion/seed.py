@@ -74,16 +74,16 @@ def smooth_runs(frames: np.ndarray, rotations: np.ndarray) -> list[np.ndarray]:
     return sorted(np.split(np.arange(len(frames)), np.flatnonzero(cut) + 1), key=len, reverse=True)
 
 
-def mirror_evidence(map_: ObjectMap, frames: np.ndarray) -> float:
+def mirror_preference(map_: ObjectMap, frames: np.ndarray) -> float:
     """By how many standard deviations consecutive `frames` fit better than their mirror image in depth.
 
     `map_` is changed; give a copy.
     """
     rotations, transl = map_.rotations[frames].copy(), map_.transl[frames].copy()
-    return evidence(map_, frames, (rotations, transl), (mirrored(rotations), transl))[0]
+    return preference(map_, frames, (rotations, transl), (mirrored(rotations), transl))[0]
 
 
-def evidence(
+def preference(
     map_: ObjectMap,
     frames: np.ndarray,
     poses: tuple[np.ndarray, np.ndarray],
@@ -96,7 +96,7 @@ def evidence(
     track fits either. `map_` is changed; give a copy.
 
     Returns:
-        The evidence, and the rotations [F, 3, 3] that both came to.
+        The preference, and the rotations [F, 3, 3] that both came to.
     """
     losses, came_to = [], []
     for rotations, transl in (poses, others):

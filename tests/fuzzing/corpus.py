@@ -25,7 +25,7 @@ from bigs.models.playback_file import load_playback, save_playback
 from bigs.types import SIDES
 
 # A reconstruction of next to nothing: what it reads and writes is that of a whole one.
-STAGES = ("hands-coarse", "hands-fine", "held", "appearance", "contact", "regrasp", "joint", "detail")
+STAGES = ("hands-coarse", "hands-fine", "grasped", "appearance", "contact", "regrasp", "joint", "detail")
 SHORT = [
     *("--preset", "smoke", "--threads", "1", "--without", "scale_search", "--without", "split"),
     *(word for stage in STAGES for word in ("--set", f"stages.{stage}.steps=1")),

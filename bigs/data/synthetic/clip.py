@@ -83,7 +83,9 @@ def make_clip(
     solid = make_object(object)
     betas = np.clip(0.5 * streams.shape.standard_normal(10), -1, 1)
     rotations, positions = turn_object(streams.motion, frames)
-    grasps = {side: find_grasp(hand_models[side], betas, solid.holds[side], solid.distance) for side in hands}
+    grasps = {
+        side: find_grasp(hand_models[side], betas, solid.places[side], solid.distance) for side in hands
+    }
     extent = [_grasp_verts(hand_models[side], betas, grasp) for side, grasp in grasps.items()]
     K, shift = frame_camera(
         np.concatenate([solid.mesh.vertices, *extent]), rotations, positions, width, height

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bigs.data.synthetic.objects import Hold, PointFunction
+from bigs.data.synthetic.objects import HandPlace, PointFunction
 
 # MANO's joint numbers of each finger, in the order of the fingertips.
 FINGERS: dict[str, tuple[int, int, int]] = {
@@ -88,14 +88,14 @@ def bend_axes(joints: np.ndarray) -> np.ndarray:
     return axes
 
 
-def find_grasp(model: HandLike, betas: np.ndarray, hold: Hold, distance: PointFunction) -> Grasp:
-    """Press and close a hand at `hold` on the object whose signed distance is `distance`."""
-    normal, thumb = np.array(hold.normal), np.array(hold.thumb)
+def find_grasp(model: HandLike, betas: np.ndarray, place: HandPlace, distance: PointFunction) -> Grasp:
+    """Press and close a hand at `place` on the object whose signed distance is `distance`."""
+    normal, thumb = np.array(place.normal), np.array(place.thumb)
     rotation = np.stack([np.cross(normal, thumb), normal, thumb], axis=1)
     joints = rest_joints(model, betas)
     owner = model.lbs_weights.argmax(dim=1).numpy()
     search = _Search(model, betas, rotation, distance, owner, joints)
-    fingers, wrist = search.press(np.array(hold.point), normal)
+    fingers, wrist = search.press(np.array(place.point), normal)
     for name in ("index", "middle", "ring", "pinky"):
         fingers = search.close_finger(fingers, wrist, FINGERS[name])
     return Grasp(search.close_thumb(fingers, wrist), rotation, wrist)

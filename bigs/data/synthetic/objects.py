@@ -27,7 +27,7 @@ _MESH_CELL = 0.0025
 
 
 @dataclass(frozen=True)
-class Hold:
+class HandPlace:
     """Where a hand holds the object, in the object's frame."""
 
     point: tuple[float, float, float]  # the palm is pressed to the surface along a line through this point
@@ -43,16 +43,16 @@ class SolidObject:
     albedo: PointFunction  # [N, 3] -> [N, 3] colours in [0, 1]
     mesh: trimesh.Trimesh  # the zero level set, with vertex colours
     normals: np.ndarray  # [V, 3] of the mesh
-    holds: dict[Side, Hold]
+    places: dict[Side, HandPlace]
 
 
 def make_object(kind: ObjectKind) -> SolidObject:
     """The object of that name."""
-    distance, albedo, half, holds = _RECIPES[kind]
+    distance, albedo, half, places = _RECIPES[kind]
     verts, faces = _cut_mesh(distance, np.array(half) + 4 * _MESH_CELL)
     colors = (albedo(verts) * 255).round().astype(np.uint8)
     mesh = trimesh.Trimesh(verts, faces, vertex_colors=colors, process=False)
-    return SolidObject(distance, albedo, mesh, surface_normals(distance, verts), holds)
+    return SolidObject(distance, albedo, mesh, surface_normals(distance, verts), places)
 
 
 def surface_normals(distance: PointFunction, points: np.ndarray) -> np.ndarray:
@@ -134,17 +134,19 @@ def _tool_distance(points: np.ndarray) -> np.ndarray:
     return np.minimum.reduce(parts)
 
 
-_BESIDE: dict[Side, Hold] = {
-    "right": Hold((0.0, 0.004, 0.038), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "left": Hold((0.0, 0.004, -0.048), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+_BESIDE: dict[Side, HandPlace] = {
+    "right": HandPlace((0.0, 0.004, 0.038), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "left": HandPlace((0.0, 0.004, -0.048), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 }
-_TOOL_HOLDS: dict[Side, Hold] = {
-    "right": Hold((0.0, 0.0, -0.02), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "left": Hold((0.045, 0.0, 0.066), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
+_AT_TOOL: dict[Side, HandPlace] = {
+    "right": HandPlace((0.0, 0.0, -0.02), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "left": HandPlace((0.045, 0.0, 0.066), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
 }
 
-_RECIPES: dict[str, tuple[PointFunction, PointFunction, tuple[float, float, float], dict[Side, Hold]]] = {
+_RECIPES: dict[
+    str, tuple[PointFunction, PointFunction, tuple[float, float, float], dict[Side, HandPlace]]
+] = {
     "box": (_box_distance, lambda p: card_print(p, BOX_HALF), tuple(BOX_HALF), _BESIDE),
     "bottle": (_bottle_distance, label_print, (0.037, 0.037, 0.105), _BESIDE),
-    "tool": (_tool_distance, rubber_and_paint, (0.122, 0.03, 0.104), _TOOL_HOLDS),
+    "tool": (_tool_distance, rubber_and_paint, (0.122, 0.03, 0.104), _AT_TOOL),
 }

@@ -18,7 +18,7 @@ from bigs.motion.features import FrameFeatures
 from bigs.motion.models import PartialModel
 from bigs.motion.object_map import MapConfig, ObjectMap
 from bigs.motion.refine import disagreement, joined, smooth_parts
-from bigs.motion.seed import evidence, mirror_evidence, mirrored
+from bigs.motion.seed import mirror_preference, mirrored, preference
 from bigs.motion.tracks import Tracks
 
 
@@ -37,7 +37,7 @@ class CheckConfig:
     least_long_step: float = 8.0
     # Standard deviations by which a segment must fit better than its mirror image in depth. Right ones had at
     # least 3.5 where little was seen, reversed ones at most 0, and bent ones 1 to 2.
-    least_evidence: float = 2.5
+    least_preference: float = 2.5
     # Difference between a partial model's rotations and the map's, degrees.
     most_disagreement: float = 5.0
     # Frames that are compared with their mirror image together; windows overlap by half.
@@ -49,7 +49,7 @@ class SfmChecks(NamedTuple):
 
     observations: np.ndarray  # [T] number of accepted observations
     uncertainty: np.ndarray  # [T] degrees relative to the best connected frame
-    mirror: np.ndarray  # [T] evidence against the mirror image in the worst window; below 0 is wrong
+    mirror: np.ndarray  # [T] preference over the mirror image in the worst window; below 0 is wrong
     cosine: np.ndarray  # [T] cosine of angular velocities before and after; 1 where nothing turns
     flags: list[list[str]]  # T lists of plain words; empty if nothing is wrong
 
@@ -86,7 +86,7 @@ def check_map(
     tied = (between <= config.most_uncertain).sum(1)
     uncertainty = between[max(range(frames), key=lambda t: (tied[t], observations[t]))]
     trial = ObjectMap(features, tracks, map_.K, MapConfig())
-    mirror = _mirror_evidence(map_, trial, config.mirror_window)
+    mirror = _mirror_preference(map_, trial, config.mirror_window)
     cosine = turn_cosines(map_.rotations)
     steps = _step_angles(map_.rotations)
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -106,7 +106,7 @@ def check_map(
     signs = {
         FEW: observations < config.least_observations,
         LOOSE: uncertainty > config.most_uncertain,
-        REVERSED: mirror < config.least_evidence,
+        REVERSED: mirror < config.least_preference,
         TURN: cosine < config.least_cosine,
         STEP: long_step,
         OTHERWISE: otherwise,
@@ -140,15 +140,17 @@ def _outdone(map_: ObjectMap, trial: ObjectMap, part: PartialModel, config: Chec
     rows = np.arange(len(part.frames))
     poses = map_.rotations[part.frames], map_.transl[part.frames]
     rotations, transl = joined(map_, part, rows)
-    better, ours, theirs = evidence(trial, part.frames, poses, (rotations[part.frames], transl[part.frames]))
+    better, ours, theirs = preference(
+        trial, part.frames, poses, (rotations[part.frames], transl[part.frames])
+    )
     off = [disagreement(map_.rotations, part._replace(rotations=turned)).max() for turned in (ours, theirs)]
     # If the part converges to the map as well, there is nothing to choose.
     one = off[1] <= config.most_disagreement
-    return off[0] <= config.most_disagreement and (one or better >= config.least_evidence)
+    return off[0] <= config.most_disagreement and (one or better >= config.least_preference)
 
 
-def _mirror_evidence(map_: ObjectMap, trial: ObjectMap, window: int) -> np.ndarray:
-    """For each frame, the least over windows of the evidence against the mirror image.
+def _mirror_preference(map_: ObjectMap, trial: ObjectMap, window: int) -> np.ndarray:
+    """For each frame, the least over windows of the preference over the mirror image.
 
     `trial` is a map of the same tracks to try it on.
     """
@@ -159,5 +161,5 @@ def _mirror_evidence(map_: ObjectMap, trial: ObjectMap, window: int) -> np.ndarr
         if len(inside) < 3:
             continue
         trial.rotations[:], trial.transl[:] = map_.rotations, map_.transl
-        least[inside] = np.minimum(least[inside], mirror_evidence(trial, inside))
+        least[inside] = np.minimum(least[inside], mirror_preference(trial, inside))
     return least

@@ -82,15 +82,15 @@ def find_grasps(
         for g, stretch in enumerate(found[side].stretches):
             of_frame[stretch.start : stretch.stop] = g
         scene.grasps[side].set(of_frame, stage.slack, poses, carrier, found[side].certainty)
-        held = scene.grasps[side].held(frames)
-        own.has_expected_depth.copy_(~held & held.any())
-        if held.any():
+        grasped = scene.grasps[side].covers(frames)
+        own.has_expected_depth.copy_(~grasped & grasped.any())
+        if grasped.any():
             log_depth = poses.wrist[:, 2].log()
-            own.expected_log_depth.copy_(expected_depths(log_depth, own.estimated_log_depth, held))
+            own.expected_log_depth.copy_(expected_depths(log_depth, own.estimated_log_depth, grasped))
             correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
-            corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, held))
+            corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, grasped))
             poses = poses._replace(
-                hand_pose=torch.where(held[:, None, None, None], poses.hand_pose, corrected)
+                hand_pose=torch.where(grasped[:, None, None, None], poses.hand_pose, corrected)
             )
         own.restart(poses)
         orient = scene.at(frames).hand(side).global_orient
@@ -241,7 +241,7 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
     return orient
 
 
-def expected_depths(log_depth: Tensor, estimated: Tensor, held: Tensor) -> Tensor:
+def expected_depths(log_depth: Tensor, estimated: Tensor, grasped: Tensor) -> Tensor:
     """Logarithmic depths [T] that frames outside grasps are expected to have.
 
     An outline says little of the depth of a hand that the image cuts off. Two guesses with unrelated errors
@@ -251,12 +251,12 @@ def expected_depths(log_depth: Tensor, estimated: Tensor, held: Tensor) -> Tenso
     Args:
         log_depth: [T] as found; only those of grasps are read.
         estimated: [T] before any image was looked at.
-        held: [T] bool, which frames are in grasps; at least one.
+        grasped: [T] bool, which frames are in grasps; at least one.
     """
-    times = np.arange(len(held))
-    known = held.numpy()
+    times = np.arange(len(grasped))
+    known = grasped.numpy()
     between = torch.from_numpy(np.interp(times, times[known], log_depth.numpy()[known])).to(log_depth)
-    carried = estimated + carried_errors(log_depth - estimated, held)
+    carried = estimated + carried_errors(log_depth - estimated, grasped)
     return 0.5 * (between + carried)
 
 

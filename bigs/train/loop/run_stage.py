@@ -217,10 +217,10 @@ def _densify(scene: Scene, step: Step, config: DensifyConfig, steps: int, state:
 def _spare_grasps(scene: Scene) -> None:
     """Zero the gradient of frames in which a hand holds the object, so that they stay as they are."""
     for side, poses in scene.hand_poses.items():
-        held = scene.grasps[side].of_frame >= 0
+        grasped = scene.grasps[side].of_frame >= 0
         for residual in (poses.orient, poses.pose, poses.position.ray, poses.position.log_depth):
             if residual.grad is not None:
-                residual.grad[held] = 0.0
+                residual.grad[grasped] = 0.0
 
 
 def _evaluate(step: Step, terms: Mapping[str, Term]) -> tuple[dict[str, Tensor], str | None]:

@@ -181,8 +181,8 @@ class GuidanceStage:
     # Undo everything if the error of the seen part, or the object's area outside its mask in any frame, grows
     # by more than this share.
     damage: float = 0.02
-    # Weight per pixel of the clip's frames, which hold what they showed of the object at the stage's start.
-    hold: float = 0.3
+    # Weight per pixel of what the clip's frames now show differently than at the stage's start.
+    frame_weight: float = 0.3
     # Leave out a prior whose error on the seen part is this many times its error on its own meshes.
     unlike: float = 1.2
 

@@ -66,10 +66,10 @@ def with_changes(config: RunConfig, changes: Iterable[str]) -> RunConfig:
         for depth, key in enumerate(keys):
             is_last = depth == len(keys) - 1
             may_be_new = bool(key) and is_last and depth > 0 and keys[depth - 1] in ("lrs", "weights")
-            check_renamed(f"--set {change}", key)
             if not separator or not isinstance(node, dict) or not (key in node or may_be_new):
                 if not separator or not isinstance(node, dict):
                     raise InputError(f"--set {change}: expected path=value, found no setting {key!r}")
+                check_renamed(f"--set {change}", key)
                 check_choice(f"--set {change}", key, node, "settings")
             if not is_last:
                 node = node[key]

@@ -56,7 +56,7 @@ _HANDS_FINE = OptimizeStage(
     image_size=160,
 )
 # Grasps are known: what all frames of one agree on moves together.
-_HELD_RATES = {
+_GRASPED_RATES = {
     "hand.orient": 0.006,
     "hand.pose": 0.008,
     "hand.pose_bias": 0.008,
@@ -67,11 +67,11 @@ _HELD_RATES = {
     "hand.grasp_pose": 0.008,
     "hand.grasp_position": 0.001,
 }
-_HELD = OptimizeStage(
-    name="held",
+_GRASPED = OptimizeStage(
+    name="grasped",
     step="single-subject",
     steps=50,
-    lrs=_HELD_RATES,
+    lrs=_GRASPED_RATES,
     weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0},
     image_size=160,
     final_lr=0.3,
@@ -80,7 +80,7 @@ _CONTACT = OptimizeStage(
     name="contact",
     step="interacting-subjects",
     steps=50,
-    lrs=_HELD_RATES,
+    lrs=_GRASPED_RATES,
     weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0, "contact": 0.1, "penetration": 0.01},
     image_size=160,
 )
@@ -153,7 +153,7 @@ _JOINT = OptimizeStage(
         "offset": 0.02,
         "shade_prior": 0.01,
         **_POSE_PRIORS,
-        # Colours now say what the prior had to say before.
+        # Colours now say what this prior had to say before.
         "pose_prior": 0.2,
         "depth_prior": 12.0,
         "rigid": 0.03,
@@ -169,12 +169,11 @@ _JOINT = OptimizeStage(
 
 # The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.
 # Without the hands' silhouettes, which would take more time there than they are worth.
-_DETAIL = replace(
-    _JOINT,
+_DETAIL = OptimizeStage(
     name="detail",
+    step="interacting-subjects",
     steps=120,
     lrs={
-        **_JOINT.lrs,
         "hand.orient": 0.002,
         "hand.pose": 0.004,
         "hand.ray": 0.0005,
@@ -182,8 +181,6 @@ _DETAIL = replace(
         "hand.grasp_orient": 0.001,
         "hand.grasp_pose": 0.002,
         "hand.grasp_position": 0.0002,
-        "object.orient": 0.0007,
-        "object.ray": 0.0002,
         # What is near enough to its place may now take its own shape and look quickly.
         "hand.color": 0.06,
         "hand.shift": 4e-4,
@@ -193,14 +190,31 @@ _DETAIL = replace(
         "object.shift": 2e-4,
         "object.size": 0.15,
         "object.opacity": 0.15,
+        "object.orient": 0.0007,
+        "object.ray": 0.0002,
+        "scene.light": 2e-3,
+        "scene.shade": 1e-2,
     },
     weights={
-        **{name: weight for name, weight in _JOINT.weights.items() if name != "silhouette"},
+        "image": 4.0,
         "mse": 300.0,
         "alpha_outside": 25.0,
+        "labels": 0.5,
+        "scale": 100.0,
+        "offset": 0.02,
+        "shade_prior": 0.01,
+        **_POSE_PRIORS,
+        "pose_prior": 0.2,
+        "depth_prior": 12.0,
+        "rigid": 0.03,
+        "contact": 0.1,
+        "penetration": 0.01,
+        "object_acceleration": 0.005,
+        "object_prior": 0.1,
     },
     image_size=480,
     frames_per_step=8,
+    frame_moments=True,
 )
 
 FAST = RunConfig(
@@ -211,7 +225,7 @@ FAST = RunConfig(
         _HANDS_FINE,
         ScaleSearchStage(),
         GraspStage(),
-        _HELD,
+        _GRASPED,
         _APPEARANCE,
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
@@ -233,7 +247,7 @@ DEMO = replace(
         replace(_HANDS_FINE, steps=60),
         ScaleSearchStage(),
         GraspStage(),
-        replace(_HELD, steps=40),
+        replace(_GRASPED, steps=40),
         replace(_APPEARANCE, steps=40),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
@@ -256,7 +270,7 @@ FULL = replace(
         replace(_HANDS_FINE, steps=200),
         ScaleSearchStage(),
         GraspStage(),
-        replace(_HELD, steps=100),
+        replace(_GRASPED, steps=100),
         replace(_APPEARANCE, steps=200),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
@@ -282,7 +296,7 @@ SMOKE = replace(
         replace(_HANDS_FINE, steps=10, image_size=80),
         ScaleSearchStage(candidates=15),
         GraspStage(),
-        replace(_HELD, steps=8, image_size=80),
+        replace(_GRASPED, steps=8, image_size=80),
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
         replace(_REGRASP, steps=8, image_size=80),

@@ -8,6 +8,8 @@ from bigs.checks import InputError
 RENAMED = {
     "spill": "alpha_outside",
     "least_sightings": "least_observations",
+    "hold": "frame_weight",
+    "held": "grasped",
 }
 
 

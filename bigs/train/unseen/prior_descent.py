@@ -36,9 +36,9 @@ _NEIGHBOURS = 8
 
 # Called with the state and the loss after every step.
 AfterStep = Callable[[StageState, float], None]
-# The loss by which the clip's frames hold the object as it was at the start; it draws from the given
+# The loss by which the clip's frames keep the object as it was at the start; it draws from the given
 # generator.
-Hold = Callable[[CanonicalObject, torch.Generator], Tensor]
+FrameLoss = Callable[[CanonicalObject, torch.Generator], Tensor]
 
 
 class Coverage(NamedTuple):
@@ -77,7 +77,7 @@ def guide_object(
     stage: GuidanceStage,
     settings: RasterSettings,
     faults: Callable[[], Tensor],
-    hold: Hold | None = None,
+    frame_loss: FrameLoss | None = None,
     seed: int = 0,
     resume: Mapping[str, Any] | None = None,
     after_step: AfterStep = lambda state, loss: None,
@@ -85,8 +85,8 @@ def guide_object(
     """Optimise what was not seen of the object in place by score distillation from virtual cameras.
 
     No gradient reaches a Gaussian that was seen. Unseen ones can still come to stand before seen ones, shine
-    through them, or leave the silhouette: `hold` speaks against that, and its faults are measured before and
-    after. All is undone if one of them grew more than the stage allows.
+    through them, or leave the silhouette. `frame_loss` speaks against that, and its faults are measured
+    before and after. All is undone if one of them grew more than the stage allows.
 
     Args:
         detail: the object's own Gaussians, as the stage found them.
@@ -96,7 +96,7 @@ def guide_object(
         stage: steps, rates, weights.
         settings: of the renderer.
         faults: [K] positive measures of how badly the object, as it is now, agrees with the clip.
-        hold: added to the prior's loss; see `Hold`.
+        frame_loss: added to the prior's loss; see `FrameLoss`.
         seed: of views, timesteps and noise.
         resume: steps done, moments, and what the Gaussians' parameters had become ("reached"), by name.
         after_step: told the state after every step, and the loss.
@@ -147,8 +147,8 @@ def guide_object(
         # Neighbours move together, so that the surface stays connected.
         rough = (detail.shift - detail.shift[neighbours].mean(1)) / spacing
         loss = prior + stage.smooth * rough[unseen].square().sum()
-        if hold is not None:
-            loss = loss + hold(canonical, generator)
+        if frame_loss is not None:
+            loss = loss + frame_loss(canonical, generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         for parameter in parameters.values():
@@ -173,10 +173,10 @@ def _fill(parameters: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> Non
 
 def _freed(canonical: CanonicalObject, free: Tensor) -> CanonicalObject:
     """The same Gaussians; gradients reach only those marked in `free` [N]."""
-    held = (
+    fixed = (
         torch.where(free.reshape(-1, *[1] * (value.ndim - 1)), value, value.detach()) for value in canonical
     )
-    return CanonicalObject(*held)
+    return CanonicalObject(*fixed)
 
 
 def _neighbours(means: Tensor) -> tuple[Tensor, float]:

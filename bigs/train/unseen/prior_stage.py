@@ -21,7 +21,7 @@ from bigs.train.plan.config import GuidanceStage
 from bigs.train.unseen.prior_descent import (
     AfterStep,
     Coverage,
-    Hold,
+    FrameLoss,
     coverage_of,
     follow,
     guide_object,
@@ -41,8 +41,8 @@ from bigs.train.unseen.visibility import (
 _LEAST_FRAMES = 3
 # Putting one back may reveal the next, so they are checked again.
 _PASSES = 3
-# Number of frames that hold the object.
-_HOLDING_FRAMES = 60
+# Number of frames that keep the object as it was.
+_KEEPING_FRAMES = 60
 
 
 @torch.no_grad()
@@ -97,8 +97,8 @@ def guide_scene(
         )
         return StageOutcome(reason, facts)
     # What shows in any frame stays, even if too few frames show it to be sure.
-    held = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
-    if held.seen.all():
+    fixed = coverage._replace(seen=coverage.seen | (weights_in_pictures(scene, evidence) >= SHOWS))
+    if fixed.seen.all():
         return StageOutcome("all of the object's Gaussians show", facts)
     found = {name: value.clone() for name, value in detail.state_dict().items()}
     some, every = guard_frames(scene.n_frames), torch.arange(scene.n_frames)
@@ -109,13 +109,13 @@ def guide_scene(
 
     done = guide_object(
         detail,
-        held,
+        fixed,
         orbit,
         denoiser,
         stage,
         evidence.settings,
         faults,
-        held_by_frames(scene, evidence, canonical, stage.hold),
+        frame_loss(scene, evidence, canonical, stage.frame_weight),
         seed,
         resume,
         after_step,
@@ -123,10 +123,10 @@ def guide_scene(
     if done.rolled_back:
         reason = f"undone, since the clip's frames would look worse ({done.worst:+.1%} error or size)"
         return StageOutcome(reason, facts)
-    _put_back(scene, evidence, detail, found, held.seen)
+    _put_back(scene, evidence, detail, found, fixed.seen)
     with torch.no_grad():
         scene.surface_verts.copy_(follow(scene.surface_verts, canonical.means, done.moved))
-    moved = 1e3 * float(done.moved[~held.seen].norm(dim=-1).mean())
+    moved = 1e3 * float(done.moved[~fixed.seen].norm(dim=-1).mean())
     looked = float((coverage.by_direction < stage.well_seen).float().mean())
     facts["prior"] = (
         f"looked from {looked:.0%} of all directions, moved what was not seen by {moved:.1f} mm on average; "
@@ -136,10 +136,10 @@ def guide_scene(
 
 
 def _put_back(
-    scene: Scene, evidence: Evidence, detail: ObjectDetail, found: Mapping[str, Tensor], held: Tensor
+    scene: Scene, evidence: Evidence, detail: ObjectDetail, found: Mapping[str, Tensor], fixed: Tensor
 ) -> None:
-    """Give those Gaussians that were not `held` [N] and have come to show in a frame what they had before."""
-    free = ~held
+    """Give Gaussians that were not `fixed` [N] and have come to show in a frame what they had before."""
+    free = ~fixed
     for _ in range(_PASSES):
         showing = free & (weights_in_pictures(scene, evidence) >= SHOWS)
         if not showing.any():
@@ -172,12 +172,12 @@ def strangeness(
     return picture_residual(denoiser, images, asked) / denoiser.familiar
 
 
-def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject, weight: float) -> Hold:
+def frame_loss(scene: Scene, evidence: Evidence, canonical: CanonicalObject, weight: float) -> FrameLoss:
     """The distance between what a frame shows of the object and what it showed of `canonical`.
 
     Summed over the pixels in which nothing hides the object, if it is there; background counts.
     """
-    frames = torch.linspace(0, scene.n_frames - 1, min(_HOLDING_FRAMES, scene.n_frames)).round().long()
+    frames = torch.linspace(0, scene.n_frames - 1, min(_KEEPING_FRAMES, scene.n_frames)).round().long()
 
     def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
         step = Step(scene, evidence, {"object": now}, Selection(frames, ("object",), labels=False))
@@ -188,8 +188,8 @@ def held_by_frames(scene: Scene, evidence: Evidence, canonical: CanonicalObject,
     with torch.no_grad():
         found = torch.cat([picture(canonical, frame) for frame in frames[:, None]])
 
-    def hold(now: CanonicalObject, generator: torch.Generator) -> Tensor:
+    def loss(now: CanonicalObject, generator: torch.Generator) -> Tensor:
         chosen = torch.randint(len(frames), (1,), generator=generator)
         return weight * (picture(now, frames[chosen]) - found[chosen]).abs().sum()
 
-    return hold
+    return loss

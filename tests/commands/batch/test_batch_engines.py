@@ -19,7 +19,7 @@ from bigs.types import Side
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="needs signals")]
 
-STAGES = ("hands-coarse", "hands-fine", "held", "appearance", "contact", "regrasp", "joint", "detail")
+STAGES = ("hands-coarse", "hands-fine", "grasped", "appearance", "contact", "regrasp", "joint", "detail")
 QUICK = [f"stages.{stage}.{change}" for stage in STAGES for change in ("steps=4", "image_size=40")]
 # The results that two undisturbed runs share byte by byte.
 RESULTS = ("scene.safetensors", "poses.npz", "gaussians/object.ply")

@@ -171,14 +171,14 @@ def test_known_errors_are_carried_to_their_neighbours_and_fade_to_the_mean() -> 
 
 
 def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
-    held = torch.zeros(30, dtype=torch.bool)
-    held[:10] = held[20:] = True
+    grasped = torch.zeros(30, dtype=torch.bool)
+    grasped[:10] = grasped[20:] = True
     true = torch.linspace(-0.5, -0.3, 30)
     wave = 0.1 * torch.sin(torch.arange(30.0))
     # An estimate that is wrong by the same everywhere, and one that wavers: half of its waver is believed.
-    for estimated, believed in ((true + 0.2, torch.zeros(30)), (true + 0.2 + wave * ~held, 0.5 * wave)):
-        expected = expected_depths(true, estimated, held)
-        torch.testing.assert_close(expected[~held], (true + believed)[~held], atol=0.02, rtol=0)
+    for estimated, believed in ((true + 0.2, torch.zeros(30)), (true + 0.2 + wave * ~grasped, 0.5 * wave)):
+        expected = expected_depths(true, estimated, grasped)
+        torch.testing.assert_close(expected[~grasped], (true + believed)[~grasped], atol=0.02, rtol=0)
 
 
 def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
@@ -199,18 +199,18 @@ def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
 def test_a_hand_turns_evenly_from_grasp_to_grasp_as_seen_from_the_object() -> None:
     carrier = axis_angle_to_matrix(torch.linspace(0, 1, 20)[:, None] * torch.tensor([0.3, 1.0, 0.2]))
     turn = torch.tensor([0.0, 0.0, 1.2])
-    held = [range(0, 6), range(15, 20)]
+    grasped = [range(0, 6), range(15, 20)]
     relative = torch.eye(3).repeat(20, 1, 1)
     relative[15:] = axis_angle_to_matrix(turn)
     wrong = relative.clone()
     wrong[6:15] = axis_angle_to_matrix(torch.tensor([2.0, 0.0, 0.0]))
-    orient = turned_between(carrier @ wrong, carrier, held, 16)
+    orient = turned_between(carrier @ wrong, carrier, grasped, 16)
     angles = rotation_angle(carrier.transpose(-1, -2) @ orient)
     torch.testing.assert_close(angles[[0, 5]], torch.zeros(2), atol=1e-3, rtol=0)
     torch.testing.assert_close(angles[15:], torch.full((5,), 1.2), atol=1e-3, rtol=0)
     steps = angles[5:16].diff()
     assert (steps > 0).all() and steps[[0, -1]].max() < 0.3 * steps.max(), "slow, fast, slow"
-    untouched = turned_between(carrier @ wrong, carrier, held, 8)
+    untouched = turned_between(carrier @ wrong, carrier, grasped, 8)
     torch.testing.assert_close(untouched, carrier @ wrong)
 
 

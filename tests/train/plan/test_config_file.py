@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,7 @@ def test_changes_that_cannot_be(change: str, smoke: RunConfig) -> None:
     ("change", "words"),
     [
         ("stages.joint.weights.spill=1", "expected alpha_outside, as it is called now, found spill"),
+        ("stages.object-prior.hold=1", "expected frame_weight, as it is called now, found hold"),
         (
             "stages.object-motion.tracker.map.least_sightings=4",
             "expected least_observations, as it is called now, found least_sightings",
@@ -227,3 +229,11 @@ def test_an_old_name_is_refused_with_the_new_one(change: str, words: str) -> Non
     node[path.split(".")[-1]] = int(value)
     with pytest.raises(InputError, match=words):
         from_plain(plain, "config.yaml")
+
+
+def test_an_old_stage_is_refused_with_the_new_one() -> None:
+    with pytest.raises(InputError, match="expected grasped, as it is called now, found held"):
+        with_changes(PRESETS["fast"], ["stages.held.steps=1"])
+    # Stages are named freely, so one may be called that again.
+    own = replace(PRESETS["fast"], stages=(replace(PRESETS["fast"].stages[1], name="held"),))
+    assert with_changes(own, ["stages.held.steps=1"]).stages[0].steps == 1

@@ -72,7 +72,7 @@ def test_what_shows_in_a_frame_stays(
 ) -> None:
     """To the last bit, even where fewer frames show it than count as having seen it; nor does more show."""
     before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
-    wild = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, hold=0.0)
+    wild = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, frame_weight=0.0)
     after, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), wild)), prior)
     assert "moved" in report.facts["prior"]
     nothing = np.zeros((5, one_side.height, one_side.width), dtype=bool)
@@ -116,7 +116,7 @@ def test_the_clips_frames_hold_what_they_show(
     found = replace(evidence, targets=replace(evidence.targets, images=step.together.colors.detach()))
     changes = []
     for weight in (0.0, 1.0):
-        stage = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, hold=weight)
+        stage = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, frame_weight=weight)
         scene, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), stage)), prior)
         assert "moved" in report.facts["prior"]
         changes.append(image_error(scene, found, ("object",), every))
