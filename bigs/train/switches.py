@@ -229,7 +229,7 @@ _INGREDIENTS = {
         _all_of(_terms("labels"), _search_labels),
     ),
     "pose_priors": Switch(
-        "the priors that hold poses, depths and shape near their estimates",
+        "what keeps poses, depths and shape near their estimates",
         _terms("orient_prior", "pose_prior", "depth_prior", "betas_prior", "object_prior"),
     ),
     "hand_geometry": Switch(
