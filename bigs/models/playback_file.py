@@ -246,7 +246,8 @@ def _assemble(metadata: dict[str, Any], tensors: dict[str, Tensor]) -> Playback:
     for side in SIDES:
         splats = part(f"{side}.splats.")
         if splats:
-            whole = {key: splats.get(key) for key in CanonicalHand._fields}
+            # What a hand may lack is not in the file.
+            whole: dict[str, Any] = {key: splats.get(key) for key in CanonicalHand._fields}
             rest = {k: v for k, v in part(f"{side}.").items() if not k.startswith("splats.")}
             hands[side] = HandPlayback(**rest, splats=CanonicalHand(**whole))
     obj = None

@@ -19,7 +19,7 @@ from bigs.train.grasps.find import Mismatch
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.targets import Targets, crop_box, load_targets
 from bigs.train.loop.terms import labels
-from bigs.train.plan.config import GraspStage, RunConfig, ScaleSearchStage, Stage
+from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side
 
@@ -76,7 +76,7 @@ class EvidenceSource:
             for side, touching in self.touching().items()
         }
 
-    def evidence(self, stage: Stage) -> Evidence:
+    def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage) -> Evidence:
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(

@@ -66,7 +66,7 @@ def group_parameters(scene: Scene, group: str) -> list[nn.Parameter]:
             owners = [getattr(grasps, _GRASP[name]) for grasps in scene.grasps.values()]
         else:
             owners = [_pose_parameter(poses, name) for poses in scene.hand_poses.values()]
-    elif scene.object_splats is None:
+    elif scene.object_splats is None or scene.object_poses is None:
         owners = []
     elif name in (*_OBJECT_FIELD, *_DETAIL):
         owners = _present([scene.object_splats], name)

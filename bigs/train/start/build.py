@@ -28,7 +28,7 @@ from bigs.train.start.completion import complete
 from bigs.train.start.initial import ObjectStart, hand_in_camera, object_in_camera, smooth_hand, smooth_object
 from bigs.train.start.object_motion import pose_errors, with_motion
 from bigs.train.start.visual_hull import convex_surface, find_object_hull
-from bigs.types import Side
+from bigs.types import Entity, Side
 
 
 class KnownPart(NamedTuple):
@@ -104,7 +104,9 @@ def build_scene(
             "object_distance": DistanceField(surfaces.solid),
         }
     n_frames = len(clip)
-    present = [*clip.hands, *(["object"] if clip.object is not None else [])]
+    present: list[Entity] = [*clip.hands]
+    if clip.object is not None:
+        present.append("object")
     scene = Scene(
         K=torch.as_tensor(clip.K, dtype=torch.float32),
         width=clip.width,
