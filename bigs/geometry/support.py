@@ -60,8 +60,13 @@ class Support:
     def known_part(self, verts: np.ndarray, faces: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """The part of a mesh that lies within `reach` metres of what is shown.
 
+        Args:
+            verts: [V, 3] metres.
+            faces: [F, 3].
+            reach: metres.
+
         Returns:
-            Indices of its vertices, and faces among these.
+            Indices [V'] of its vertices, and faces [F', 3] among these.
         """
         near = self._shown.query(verts)[0] < reach
         kept = faces[near[faces].all(axis=1)]

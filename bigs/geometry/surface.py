@@ -35,7 +35,7 @@ class DistanceGrid:
 
 
 def empty_grid(lower: np.ndarray, upper: np.ndarray, resolution: int) -> DistanceGrid:
-    """A grid over a box whose longest side has `resolution` cells."""
+    """Zeros over the box from `lower` [3] to `upper` [3], whose longest side has `resolution` cells."""
     spacing = float((upper - lower).max()) / resolution
     shape = np.ceil((upper - lower) / spacing).astype(int) + 1
     return DistanceGrid(np.zeros(shape), lower.copy(), spacing)

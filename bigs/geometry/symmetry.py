@@ -66,7 +66,7 @@ class Symmetry:
 
 
 def across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors at right angles to a unit direction and to each other."""
+    """Two unit vectors [3] at right angles to a unit direction [3] and to each other."""
     helper = np.eye(3)[np.argmin(np.abs(direction))]
     first = np.cross(direction, helper)
     first = first / np.linalg.norm(first)

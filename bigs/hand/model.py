@@ -141,7 +141,14 @@ class HandModel(nn.Module):
         return HandOutput(vertices, joints, skeleton.bone_transforms)
 
     def skeleton(self, betas: Tensor, hand_pose: Tensor, global_orient: Tensor, wrist: Tensor) -> Skeleton:
-        """The bones alone; arguments as in `forward`."""
+        """The bones alone, without skinning.
+
+        Args:
+            betas: [10], or [T, 10].
+            hand_pose: [T, 15, 3, 3].
+            global_orient: [T, 3, 3].
+            wrist: [T, 3] metres.
+        """
         shaped = self.rest_vertices(betas)
         rotations = torch.cat([global_orient[:, None], hand_pose], dim=1)
         return Skeleton(

@@ -42,21 +42,22 @@ def surface_gaps(distances: Tensor, count: int = 30, reach: float = 0.01) -> Ten
 
 
 def surface_contact(distances: Tensor, touching: Tensor, count: int = 30) -> Tensor:
-    """Draws the part of a hand that reaches furthest onto the object's surface where the image shows touch.
+    """Mean of `surface_gaps` over the frames that touch: draws the part that reaches furthest to the surface.
 
     Args:
         distances: [B, V] signed distances of the hand's vertices from the object, metres.
-        touching: [B] in [0, 1].
+        touching: [B] in [0, 1], how sure it is that the hand touches the object.
         count: see `surface_gaps`.
     """
     return (surface_gaps(distances, count) * touching).sum() / touching.sum().clamp_min(1.0)
 
 
 def penetration(distances: Tensor, tolerance: float = 0.001) -> Tensor:
-    """Squared depth beyond `tolerance` (metres), in centimetres, summed over vertices, a mean over frames.
+    """Sum over vertices of max(-d - tolerance, 0)^2, a mean over frames, in centimetres squared.
 
     Args:
-        distances: [B, V] signed distances from the object, metres.
+        distances: [B, V] signed distances d of the hand's vertices from the object, metres; negative inside.
+        tolerance: depth in metres that costs nothing.
     """
     depth = 100.0 * torch.relu(-distances - tolerance)
     return depth.square().sum(1).mean()

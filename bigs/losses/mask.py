@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
-    """The paper's mask regulariser (1 - m) I_pred (Eq. 5), a mean over the outside's pixels and channels.
+    """The paper's mask regulariser |(1 - m) I_pred| (Eq. 5), a mean over the outside's pixels and channels.
 
     Args:
         pred: [..., D], rendered on black.
@@ -18,7 +18,7 @@ def outside_mask(pred: Tensor, foreground: Tensor) -> Tensor:
 
 
 def alpha_outside_masks(alphas: Tensor, empty: Tensor, foreground: Tensor) -> Tensor:
-    """Squared alpha where nothing is, per pixel of the masks.
+    """Sum of e A^2 over the sum of m: squared alpha A where nothing is (e), per pixel of the masks m.
 
     A mean over the outside would count a pixel there the less the more of them there are, and Gaussians that
     may grow would rather glow beyond an outline than miss it. Colour would let black ones stand anywhere.
@@ -66,10 +66,12 @@ def amodal_silhouette(alpha: Tensor, own: Tensor, hidden: Tensor) -> Tensor:
 
 
 def label_difference(pred: Tensor, labels: Tensor) -> Tensor:
-    """Entity channels of one joint rendering against the visible masks: occlusion order included.
+    """Sum of (pred - labels)^2 over the sum of labels: one joint rendering against the visible masks.
+
+    It sees who hides whom, since a channel is dimmed by all that lies in front of its subject.
 
     Args:
-        pred: [..., E] rendered label channels.
-        labels: [..., E] visible shares.
+        pred: [..., E] rendered label channels, one for each of E subjects, in [0, 1].
+        labels: [..., E] visible share of each subject in a pixel, in [0, 1].
     """
     return (pred - labels).square().sum() / labels.sum().clamp_min(1.0)

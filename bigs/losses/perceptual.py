@@ -28,7 +28,7 @@ class VggWeights:
     channel_weights: tuple[Tensor, ...] | None = None  # LPIPS's, [C] for each of the five blocks
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """All there is, in a fixed order."""
+        """All weights, in a fixed order; for a digest."""
         pairs = [values for pair in self.convolutions for values in pair]
         return (*pairs, *(self.channel_weights or ()))
 

@@ -6,20 +6,20 @@ from torch import Tensor
 
 
 def color_spread(colors: Tensor) -> Tensor:
-    """Mean distance of the colours [N, 3] from their mean (paper's L_color)."""
+    """Mean over N colours c [N, 3] of ||c - mean c||_1 (the paper's L_color, Eq. 5)."""
     return (colors - colors.mean(0)).abs().mean(0).sum()
 
 
 def scale_size(scales: Tensor) -> Tensor:
-    """Mean squared standard deviation [N, 3], metres squared, summed over axes (paper's L_scale)."""
+    """Mean over N Gaussians of ||s||^2, standard deviations s [N, 3] in metres (the paper's L_scale, Eq. 5)."""
     return scales.square().mean(0).sum()
 
 
 def lbs_deviation(weights: Tensor, target: Tensor) -> Tensor:
-    """Squared Frobenius distance of LBS weights [N, J] from the 6-neighbour target, per Gaussian (Eq. 6)."""
+    """||W - W_near||_F^2 / N (Eq. 6): skinning weights [N, J] against those of the 6 nearest vertices."""
     return (weights - target).square().sum() / len(weights)
 
 
 def squared_norm(residuals: Tensor) -> Tensor:
-    """Mean squared length of vectors [..., D]: the prior on a residual."""
+    """Mean of ||r||^2 over residuals r [..., D], in their own unit squared: a normal prior around zero."""
     return residuals.square().sum(-1).mean()

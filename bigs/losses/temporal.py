@@ -6,13 +6,13 @@ from torch import Tensor
 
 
 def pose_steps(rotations: Tensor, positions: Tensor) -> Tensor:
-    """The paper's L_smt (Eq. 6): squared change of pose and translation from frame to frame.
+    """The paper's L_smt (Eq. 6): mean of ||R' - R||_F^2 / 2 + ||x' - x||^2 from a frame to the next (').
 
-    Rotations differ by their matrices' Frobenius distance, which to first order is sqrt(2) times the angle
-    and, unlike axis-angle differences, knows no jump at pi.
+    The Frobenius distance of rotations is to first order sqrt(2) times their angle and, unlike axis-angle
+    differences, knows no jump at pi.
 
     Args:
-        rotations: [T, J, 3, 3].
+        rotations: [T, J, 3, 3], summed over J joints.
         positions: [T, 3] metres.
     """
     if len(rotations) < 2:
@@ -23,9 +23,12 @@ def pose_steps(rotations: Tensor, positions: Tensor) -> Tensor:
 
 
 def acceleration(points: Tensor) -> Tensor:
-    """Mean squared second difference of points [T, N, 3] in centimetres per frame squared.
+    """Mean of ||x_{t+1} - 2 x_t + x_{t-1}||^2 over points and frames, in centimetres squared per frame^4.
 
     Centimetres, so that an ordinary hand's values are near one.
+
+    Args:
+        points: [T, N, 3] metres.
     """
     if len(points) < 3:
         return points.sum() * 0.0
@@ -34,9 +37,13 @@ def acceleration(points: Tensor) -> Tensor:
 
 
 def velocity(points: Tensor, together: Tensor) -> Tensor:
-    """Mean squared step of points [T, N, 3], in centimetres, over the pairs of frames in `together` [T - 1].
+    """Mean of ||x_{t+1} - x_t||^2 over points and some pairs of frames, in centimetres squared.
 
     Given points in the object's frame and the pairs in which a hand holds it, this is the rigid-grasp term.
+
+    Args:
+        points: [T, N, 3] metres.
+        together: [T - 1] weight of each pair of neighbouring frames, in [0, 1].
     """
     if len(points) < 2:
         return points.sum() * 0.0

@@ -55,12 +55,15 @@ class FreeGaussians(nn.Module):
 
     @property
     def scales(self) -> Tensor:
+        """Standard deviations [N, 3], metres."""
         return (self.base_log_scales + self.size).exp()
 
     @property
     def opacities(self) -> Tensor:
+        """[N] in (0, 1)."""
         return torch.sigmoid(self.opacity_logits + self.opacity)
 
     @property
     def colors(self) -> Tensor:
+        """[N, 3] in (0, 1)."""
         return torch.sigmoid(self.color_logits + self.color)

@@ -47,6 +47,7 @@ class Grasps(nn.Module):
 
     @property
     def count(self) -> int:
+        """The number of grasps."""
         return int(self.of_frame.max()) + 1
 
     def covers(self, frames: Tensor) -> Tensor:

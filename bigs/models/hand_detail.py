@@ -32,6 +32,7 @@ class HandDetail(FreeGaussians):
         self.register_buffer("base_weights", splats.weights.detach().clone())
 
     def forward(self) -> CanonicalHand:
+        """The Gaussians as their parameters are now."""
         return CanonicalHand(
             self.base_means + self.offsets,
             self.shapedirs,

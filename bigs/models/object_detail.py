@@ -26,6 +26,7 @@ class ObjectDetail(FreeGaussians):
         self.register_buffer("weights", torch.zeros(count, N_PARTS))
 
     def forward(self) -> CanonicalObject:
+        """The Gaussians as their parameters are now."""
         offsets = self.offsets
         return CanonicalObject(
             self.base_means + offsets,

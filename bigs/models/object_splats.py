@@ -85,6 +85,7 @@ class ObjectSplats(nn.Module):
 
     @property
     def anchors(self) -> Anchors:
+        """Where the fields are evaluated now."""
         return Anchors(*(getattr(self, name) for name in Anchors._fields))
 
     def place(self, anchors: Anchors) -> None:

@@ -112,6 +112,7 @@ class Playback:
 
     @property
     def entities(self) -> tuple[Entity, ...]:
+        """The hands that there are, then the object if there is one."""
         return (*self.hands, "object") if self.object is not None else tuple(self.hands)
 
     def __len__(self) -> int:
@@ -199,7 +200,14 @@ class Playback:
 def record(
     scene: Scene, name: str, frame_names: tuple[str, ...], normalize_shift: Sequence[float] | np.ndarray
 ) -> Playback:
-    """Evaluate a scene once and keep what is needed to show it."""
+    """Evaluate a scene once and keep what is needed to show it.
+
+    Args:
+        scene: stays as it is.
+        name: of the clip; names files.
+        frame_names: T names.
+        normalize_shift: [3] of the clip, see `Playback`.
+    """
     frames = torch.arange(scene.n_frames)
     canonical = scene.canonical(scene.entities)
     hands: dict[Side, HandPlayback] = {}

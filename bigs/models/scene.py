@@ -95,6 +95,7 @@ class Scene(nn.Module):
 
     @property
     def object_surface(self) -> ObjectSurface | None:
+        """The object's surface as it is now; None without an object."""
         if self.surface_verts is None:
             return None
         return ObjectSurface(self.surface_verts, self.surface_faces)
@@ -105,14 +106,17 @@ class Scene(nn.Module):
 
     @property
     def sides(self) -> tuple[Side, ...]:
+        """The hands that there are."""
         return tuple(side for side in SIDES if side in self.hand_poses)
 
     @property
     def entities(self) -> tuple[Entity, ...]:
+        """The hands that there are, then the object if there is one."""
         return (*self.sides, "object") if self.object_splats is not None else self.sides
 
     @property
     def n_frames(self) -> int:
+        """T, the number of the clip's frames."""
         first = next(iter(self.hand_poses.values())) if self.sides else self.object_poses
         return len(first.base_orient)
 
@@ -125,6 +129,7 @@ class Scene(nn.Module):
         return self.hand_splats[self.canonical_side(side)].model
 
     def hand_betas(self, side: Side) -> Tensor:
+        """The shape [10] of a side, which both sides share where they share the hand."""
         return self.betas[self.canonical_side(side)]
 
     def canonical(self, entities: Iterable[Entity]) -> dict[Entity, CanonicalHand | CanonicalObject]:
@@ -153,5 +158,5 @@ class Scene(nn.Module):
         return pose_splats(hand, betas, poses.hand_pose, skeleton.bone_transforms, side)
 
     def free_frames(self, side: Side) -> Tensor:
-        """The frames in which a hand belongs to no grasp, rising."""
+        """Indices [F] of the frames in which a hand belongs to no grasp, rising."""
         return torch.nonzero(self.grasps[side].of_frame < 0).flatten()
