@@ -11,7 +11,7 @@ def color_spread(colors: Tensor) -> Tensor:
 
 
 def scale_size(scales: Tensor) -> Tensor:
-    """Mean over N Gaussians of ||s||^2, standard deviations s [N, 3] in metres (the paper's L_scale, Eq. 5)."""
+    """Mean over N Gaussians of ||s||^2 for standard deviations s [N, 3], metres (paper's L_scale, Eq. 5)."""
     return scales.square().mean(0).sum()
 
 
