@@ -116,6 +116,21 @@ _REGRASP = OptimizeStage(
     free_frames=True,
 )
 
+# What keeps poses, shape and appearance plausible while everything moves together.
+_PLAUSIBLE_TOGETHER = {
+    "scale": 100.0,
+    "offset": 0.02,
+    "shade_prior": 0.01,
+    **_POSE_PRIORS,
+    # Colours now say what this prior had to say before.
+    "pose_prior": 0.2,
+    "depth_prior": 12.0,
+    "rigid": 0.03,
+    "contact": 0.1,
+    "penetration": 0.01,
+    "object_acceleration": 0.005,
+    "object_prior": 0.1,
+}
 # Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
 # have given shape and rough colours; from here on every Gaussian has parameters of its own (`SplitStage`).
 _JOINT = OptimizeStage(
@@ -149,18 +164,7 @@ _JOINT = OptimizeStage(
         "alpha_outside": 4.0,
         "labels": 0.5,
         "silhouette": 4.0,
-        "scale": 100.0,
-        "offset": 0.02,
-        "shade_prior": 0.01,
-        **_POSE_PRIORS,
-        # Colours now say what this prior had to say before.
-        "pose_prior": 0.2,
-        "depth_prior": 12.0,
-        "rigid": 0.03,
-        "contact": 0.1,
-        "penetration": 0.01,
-        "object_acceleration": 0.005,
-        "object_prior": 0.1,
+        **_PLAUSIBLE_TOGETHER,
     },
     image_size=240,
     frames_per_step=6,
@@ -200,17 +204,7 @@ _DETAIL = OptimizeStage(
         "mse": 300.0,
         "alpha_outside": 25.0,
         "labels": 0.5,
-        "scale": 100.0,
-        "offset": 0.02,
-        "shade_prior": 0.01,
-        **_POSE_PRIORS,
-        "pose_prior": 0.2,
-        "depth_prior": 12.0,
-        "rigid": 0.03,
-        "contact": 0.1,
-        "penetration": 0.01,
-        "object_acceleration": 0.005,
-        "object_prior": 0.1,
+        **_PLAUSIBLE_TOGETHER,
     },
     image_size=480,
     frames_per_step=8,
