@@ -163,7 +163,7 @@ class ObjectPoses(nn.Module):
     is the one quantity a single camera cannot see.
 
     Residuals of turn and ray count in usual errors of an estimate. Where the start is known better they are
-    scaled down alike, so that one learning rate and one prior suit frames of all kinds.
+    scaled down alike, so that one learning rate and one pose prior suit frames of all kinds.
     """
 
     base_orient: Tensor
@@ -190,7 +190,7 @@ class ObjectPoses(nn.Module):
         # Factors on the residuals, at most 1.
         self.register_buffer("turn_freedom", turn)
         self.register_buffer("ray_freedom", ray)
-        # Whether the start was measured, so that a prior also holds its rays.
+        # Whether the start was measured, so that its pose prior counts rays, too.
         self.register_buffer("measured", torch.tensor(float(errors is not None)))
 
     def forward(self, frames: Tensor) -> ObjectFrames:

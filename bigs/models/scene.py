@@ -87,7 +87,7 @@ class Scene(nn.Module):
         )
         self.object_splats = object_splats
         self.object_poses = object_poses
-        # Stored with the trained values, since a prior may change it.
+        # Stored with the trained values, since completion may change it.
         self.register_buffer("surface_verts", None if object_surface is None else object_surface.verts)
         self.register_buffer("surface_faces", None if object_surface is None else object_surface.faces)
         self.object_distance = object_distance

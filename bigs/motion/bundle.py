@@ -72,7 +72,7 @@ def adjust(
     """Minimise reprojection errors under the motion prior.
 
     Args:
-        bundle: start values. A frame without observations is placed by the prior alone.
+        bundle: start values. A frame without observations is placed by the motion prior alone.
         K: [3, 3] intrinsics.
         config: see there.
         free: [T] bool, frames whose pose may change; all by default.
@@ -215,7 +215,7 @@ def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np
 
 
 def _linearise(problem: _Problem, bundle: Bundle) -> System:
-    """Normal equations about `bundle`, the prior's part included."""
+    """Normal equations about `bundle`, the motion prior's part included."""
     frames = int(problem.free.sum())
     system = linearise(
         problem.seen,
@@ -227,14 +227,14 @@ def _linearise(problem: _Problem, bundle: Bundle) -> System:
         frames,
     )
     poses, gradient = system.poses.reshape(frames, 6, frames, 6), system.pose_gradient.reshape(frames, 6)
-    _add_prior(poses, gradient, bundle, problem)
+    _add_motion_prior(poses, gradient, bundle, problem)
     if problem.anchor is not None:
         _add_anchor(poses, gradient, bundle, problem, problem.anchor)
     return system
 
 
-def _add_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem) -> None:
-    """Add the prior's part in place. Steps are small, so turns are differenced as if they commuted."""
+def _add_motion_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem) -> None:
+    """Add the motion prior's part in place. Steps are small, so turns are differenced as if they commuted."""
     config, free = problem.config, problem.free
     depth = float(np.median(bundle.transl[:, 2]))
     scales = (1.0 / np.radians(config.turn_sigma), 1.0 / (config.shift_sigma * depth))

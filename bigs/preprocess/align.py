@@ -54,7 +54,7 @@ class AlignConfig:
     shift_sigma: float = USUAL_DEPTH_SIGMA
     shift_outlier: float = 3.0
     change_sigma: float = 0.005
-    prior: float = 0.1
+    shift_weight: float = 0.1
     # Mask pixels of hand and object that are this near each other touch.
     touch_pixels: int = 3
     # Use every Nth vertex.
@@ -199,7 +199,7 @@ def contact_costs(
     Args:
         verts: [T, V, 3] of the hand, camera frame.
         rays: [T, 3] unit.
-        touching: [T] bool; the other frames only have the prior.
+        touching: [T] bool; in the other frames only shifts cost.
         poses: rotations [T, 3, 3] and translations [T, 3] of the object at factor 1.
         surface: the object's at factor 1, in its own frame.
         factor: on size and depth together.
@@ -213,7 +213,9 @@ def contact_costs(
     shares = np.linspace(-config.reach, config.reach, config.shifts)
     shifts = depth[:, None] * shares
     squares = (shares / config.shift_sigma) ** 2
-    costs = np.tile(config.prior * squares / (1.0 + squares / config.shift_outlier**2), (len(verts), 1))
+    costs = np.tile(
+        config.shift_weight * squares / (1.0 + squares / config.shift_outlier**2), (len(verts), 1)
+    )
     count = min(max(config.nearest // config.every, 1), verts.shape[1])
     for t in np.flatnonzero(touching):
         at = (verts[t] @ rotations[t]) / factor - transl[t] @ rotations[t]
@@ -241,7 +243,7 @@ def sample_grid(grid: DistanceGrid, points: np.ndarray) -> np.ndarray:
 def cheapest_path(costs: np.ndarray, config: AlignConfig) -> tuple[float, np.ndarray]:
     """The choice [T] of one column a frame with the least sum of `costs` [T, S] and of squared changes."""
     shares = np.linspace(-config.reach, config.reach, costs.shape[1])
-    change = config.prior * ((shares[:, None] - shares) / config.change_sigma) ** 2
+    change = config.shift_weight * ((shares[:, None] - shares) / config.change_sigma) ** 2
     total = costs[0].copy()
     came = np.zeros(costs.shape, dtype=int)
     for t in range(1, len(costs)):

@@ -79,7 +79,7 @@ def check_map(
     frames = len(map_.posed)
     observations = np.bincount(map_.frame[map_.use()], minlength=frames)
     bundle, _ = map_.bundle(np.arange(frames))
-    # The prior is nearly removed, so the observations count.
+    # The motion prior is nearly removed, so that the observations count.
     loose = replace(map_.config.bundle, turn_sigma=3.0, shift_sigma=0.015)
     between = turn_uncertainties(bundle, map_.K, loose)
     # Of two loosely connected parts the larger one is believed.

@@ -29,7 +29,7 @@ GROUPS = (
     "scene.shade",
 )
 # Parameters with one row per frame. A step that does not look at a frame says nothing about its rotations and
-# fingers; rays and depths gain from momentum and from priors over time.
+# fingers; rays and depths gain from momentum and from smoothness in time.
 _ROW_PER_FRAME = ("hand.orient", "hand.pose", "object.orient")
 FIELD_GROUPS = {
     "hand": tuple(f"hand.{name}" for name in (*_HAND_FIELD, *_DETAIL[:-1])),

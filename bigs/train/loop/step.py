@@ -31,7 +31,7 @@ class Evidence:
     contact: str  # "center" or "surface"
     settings: RasterSettings
     perceptual: VggWeights | None = None  # the network of the term "perceptual"
-    denoiser: Denoiser | None = None  # the prior of the term "sds"
+    denoiser: Denoiser | None = None  # the diffusion prior of the term "sds"
 
 
 # A pixel counts as covered by an unlabelled occluder above this share.
@@ -46,7 +46,7 @@ class Selection:
     entities: tuple[Entity, ...] = ()  # rendered alone or together; none if no term looks at Gaussians
     labels: bool = True  # whether the joint rendering has label channels
     seed: int = 0  # random seed of the terms
-    free_frames: bool = False  # whether a hand alone is rendered where it holds nothing, not at `frames`
+    free_frames: bool = False  # whether a hand alone is rendered where it is in no grasp, not at `frames`
     progress: float = 0.0  # share of the stage's steps that is done
     pull: bool = False  # whether `Step.object_pull` will be needed
 
