@@ -141,7 +141,7 @@ class PriorConfig:
 
 @dataclass(frozen=True)
 class CompletionStage:
-    """The object's symmetries complete it where it was never seen (see `completed_scene`).
+    """The object's symmetries complete it where it was never seen (see `train.unseen.symmetry_stage`).
 
     With the prior off there is no such stage.
     """
@@ -154,7 +154,7 @@ class CompletionStage:
 
 @dataclass(frozen=True)
 class GuidanceStage:
-    """A diffusion prior completes the object where it was never seen (paper Eq. 7; see `guided`).
+    """A diffusion prior completes the object where it was never seen (Eq. 7; see `train.unseen.prior_stage`).
 
     Without a prior's weights, or where the clip saw all of the object, there is no such stage.
     """
