@@ -57,7 +57,9 @@ class Triplane(nn.Module):
 
     @property
     def out_features(self) -> int:
+        """Length 3F of a point's features."""
         return 3 * self.planes.shape[1]
 
     def forward(self, xyz: Tensor) -> Tensor:
+        """Features [N, 3F] of points [N, 3]."""
         return sample_triplane(self.planes, xyz, self.bounds)

@@ -13,6 +13,7 @@ def array(tensor: Tensor) -> np.ndarray:
 
 
 def array_or_none(tensor: Tensor | None) -> np.ndarray | None:
+    """The same where there may be nothing."""
     return None if tensor is None else array(tensor)
 
 

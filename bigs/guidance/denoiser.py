@@ -75,7 +75,7 @@ class Denoiser(Protocol):
 
 
 def classifier_free(conditional: Tensor, unconditional: Tensor, scale: float) -> Tensor:
-    """Estimates with and without the condition, mixed: `unconditional + scale (conditional - unconditional)`.
+    """Estimates [B, c, h, w] mixed: `unconditional + scale (conditional - unconditional)`.
 
     Ho and Salimans, "Classifier-free diffusion guidance" (2022), in the form in which scale 1 is the
     conditional estimate and 0 the unconditional one.

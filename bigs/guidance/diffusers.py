@@ -88,30 +88,40 @@ class StableDiffusion:
 
     @property
     def alphas_cumprod(self) -> Tensor:
+        """[T] of the model's own scheduler."""
         alphas: Tensor = self._parts.scheduler.alphas_cumprod
         return alphas
 
     @property
     def image_size(self) -> int:
+        """Rows and columns of the pictures that the VAE takes."""
         return self._parts.image_size
 
     @property
     def detect_edges(self) -> EdgeDetector | None:
+        """The ControlNet's; None without one."""
         return self._edges
 
     @property
     def familiar(self) -> float | None:
-        return None  # its training data are unknown
+        """None, since its training data are unknown."""
+        return None
 
     @property
     def fingerprint(self) -> str:
+        """See `Denoiser`."""
         return fingerprint(self._weights, self._settings)
 
     def encode(self, images: Tensor) -> Tensor:
-        """The mean of the VAE's distribution, scaled as the model expects its latents."""
+        """The mean [B, c, h, w] of the VAE's distribution, scaled as the model expects its latents."""
         return encode_images(self._parts, images)
 
     def predict(self, noisy: Tensor, timesteps: Tensor, conditions: Conditions) -> Tensor:
+        """The noise [B, c, h, w], `classifier_free` between the view's prompt and the negative one.
+
+        Raises:
+            InputError: there is a ControlNet, and `conditions` has no edges.
+        """
         device, dtype = self._parts.unet.device, self._parts.unet.dtype
         views = view_indices(conditions.azimuths, conditions.elevations).to(device)
         negative = self._negative.expand(len(noisy), -1, -1)

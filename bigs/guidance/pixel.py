@@ -128,14 +128,16 @@ class PixelDenoiser:
 
     @property
     def fingerprint(self) -> str:
+        """See `Denoiser`."""
         return fingerprint(self.net.state_dict(), (self.net.config, self.guidance_scale, self.familiar))
 
     def encode(self, images: Tensor) -> Tensor:
+        """Pictures [B, 3, H, W] in [0, 1] as pictures in [-1, 1]."""
         return 2.0 * images - 1.0
 
     @torch.no_grad()
     def predict(self, noisy: Tensor, timesteps: Tensor, conditions: Conditions) -> Tensor:
-        """The noise; `classifier_free` between edges and view known, and neither."""
+        """The noise [B, 3, H, W]; `classifier_free` between edges and view known, and neither."""
         count = len(noisy)
         edges = torch.zeros_like(noisy[:, :1]) if conditions.edges is None else conditions.edges.to(noisy)
         edges_known = torch.full((count,), conditions.edges is not None)

@@ -18,6 +18,7 @@ class Resolved(NamedTuple):
 
     @property
     def notes(self) -> list[str]:
+        """What to tell, a line each."""
         return [note for note in (self.perceptual, self.prior) if note]
 
 

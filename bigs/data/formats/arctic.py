@@ -54,12 +54,15 @@ class ArcticView(NamedTuple):
 
     @property
     def object_name(self) -> str:
+        """The object's name, with which a sequence's begins."""
         return self.sequence.split("_")[0]
 
     def raw(self, kind: str) -> Path:
+        """The file of annotations of a kind: mano, object or egocam.dist."""
         return self.root / "raw_seqs" / self.subject / f"{self.sequence}.{kind}.npy"
 
     def frames_in(self, tree: str) -> Path:
+        """The view's folder below `tree`: images, cropped_images or masks."""
         return self.root / tree / self.subject / self.sequence / str(self.view)
 
 

@@ -50,6 +50,7 @@ class Ho3dClip(NamedTuple):
 
     @property
     def root(self) -> Path:
+        """The release's folder."""
         return self.folder.parent.parent
 
 

@@ -34,6 +34,7 @@ class Pull(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> Pull:
+        """Of `count` Gaussians, before any step."""
         return cls(torch.zeros(count), torch.zeros(count), torch.zeros(count, 3))
 
     def plus(self, on_screen: Tensor, shown: Tensor, drift: Tensor) -> Pull:

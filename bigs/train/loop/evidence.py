@@ -77,6 +77,7 @@ class EvidenceSource:
         }
 
     def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage) -> Evidence:
+        """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(
@@ -118,6 +119,7 @@ class EvidenceSource:
         return ask
 
     def targets(self, size: int) -> Targets:
+        """Images and masks, shrunk as a frame to a long side of `size` pixels; 0 keeps the clip's size."""
         if size not in self._targets:
             long_side = max(self.clip.width, self.clip.height)
             scale = min(1.0, size / long_side) if size else 1.0

@@ -68,14 +68,17 @@ class Step:
 
     @property
     def entities(self) -> tuple[Entity, ...]:
+        """The subjects that are rendered."""
         return self.selection.entities
 
     @property
     def frames(self) -> Tensor:
+        """Indices [B] of the frames that are looked at."""
         return self.selection.frames
 
     @property
     def sides(self) -> tuple[Side, ...]:
+        """The hands among the subjects that are rendered."""
         return tuple(e for e in self.entities if e != "object")
 
     @cached_property
@@ -84,36 +87,39 @@ class Step:
         return self.scene.at(torch.arange(self.scene.n_frames))
 
     def frames_of(self, entity: Entity) -> Tensor:
-        """The frames in which a subject is looked at alone."""
+        """Indices [B] of the frames in which a subject is looked at alone."""
         if self.selection.free_frames and entity != "object":
             return self.scene.free_frames(entity)
         return self.frames
 
     @cached_property
     def images(self) -> Tensor:
+        """The clip's images [B, H, W, 3] in [0, 1]."""
         return _at(self.evidence.targets.images, self.frames)
 
     @cached_property
     def foreground(self) -> Tensor:
+        """The share [B, H, W] of each pixel that shows any subject."""
         return _at(self.evidence.targets.foreground, self.frames)
 
     def share(self, entity: Entity) -> Tensor:
+        """The share [B, H, W] of each pixel that shows a subject."""
         return _at(self.evidence.targets.shares[entity], self.frames)
 
     def images_alone(self, entity: Entity) -> Tensor:
-        """The images in which a subject is looked at alone."""
+        """The images [B, H, W, 3] in which a subject is looked at alone."""
         return _at(self.evidence.targets.images, self.frames_of(entity))
 
     def share_alone(self, entity: Entity) -> Tensor:
-        """The subject's share of their pixels."""
+        """The subject's share [B, H, W] of their pixels."""
         return _at(self.evidence.targets.shares[entity], self.frames_of(entity))
 
     def hidden_alone(self, entity: Entity) -> Tensor:
-        """The share of their pixels in which something else may hide it."""
+        """The share [B, H, W] of their pixels in which something else may hide it."""
         return _at(self.evidence.targets.hidden[entity], self.frames_of(entity))
 
     def foreground_alone(self, entity: Entity) -> Tensor:
-        """The share of their pixels that shows any subject."""
+        """The share [B, H, W] of their pixels that shows any subject."""
         return _at(self.evidence.targets.foreground, self.frames_of(entity))
 
     def generator(self) -> torch.Generator:
@@ -199,7 +205,10 @@ class Step:
         return self._alone_terms[entity]
 
     def silhouette(self, side: Side) -> Tensor:
-        """How far the outline of a hand's few opaque Gaussians is from what its own mask allows."""
+        """How far the outline of a hand's few opaque Gaussians is from what its own mask allows, a scalar.
+
+        See `losses.mask.amodal_silhouette`.
+        """
         posed = self.posed_clip.at(self.frames_of(side)).posed_hand(side, self.evidence.silhouettes[side])
         return self._against_own(side, None, self.render(posed).alphas).coverage
 
@@ -222,6 +231,7 @@ class Step:
 
     @property
     def has_object(self) -> bool:
+        """Whether the scene has an object."""
         return self.scene.object_splats is not None
 
 

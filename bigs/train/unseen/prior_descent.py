@@ -50,6 +50,7 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
+        """The share of the Gaussians that was seen, in [0, 1]."""
         return float(self.seen.float().mean())
 
 
