@@ -175,7 +175,7 @@ def test_the_cheapest_path_is_the_cheapest_of_all() -> None:
         moved = np.diff(shares[list(path)])
         return float(
             sum(costs[t, s] for t, s in enumerate(path))
-            + config.prior * ((moved / config.change_sigma) ** 2).sum()
+            + config.shift_weight * ((moved / config.change_sigma) ** 2).sum()
         )
 
     best = min(np.ndindex(4, 4, 4, 4), key=total)
