@@ -178,7 +178,7 @@ def test_objects_and_grasps(kind: Any, hand_models: dict[Side, HandModel]) -> No
     away = solid.distance(solid.mesh.vertices + 0.004 * solid.normals)
     assert np.median(np.abs(away - 0.004)) < 1e-4
     for side, model in hand_models.items():
-        grasp = find_grasp(model, np.zeros(10), solid.holds[side], solid.distance)
+        grasp = find_grasp(model, np.zeros(10), solid.places[side], solid.distance)
         verts, _ = pose_hand(
             model, np.zeros(10), grasp.fingers[None], grasp.rotation[None], grasp.wrist[None]
         )
