@@ -64,7 +64,7 @@ lint:
 	cargo clippy --quiet --workspace --all-targets -- -D warnings
 
 test-rust:
-	cargo test --quiet -p bigs-raster -p bigs-ops -p bigs-track -p bigs-raster-checks
+	cargo test --quiet -p bigs-raster -p bigs-ops -p bigs-shape -p bigs-track -p bigs-raster-checks
 
 test-python:
 	$(BIN)/python -m pytest -n $(TEST_WORKERS) --dist worksteal

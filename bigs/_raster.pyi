@@ -10,7 +10,10 @@ from bigs.raster.settings import RasterSettings
 __all__ = [
     "DistanceState",
     "RasterState",
+    "SymmetryJudge",
     "__version__",
+    "beyond_planes",
+    "cone_distances",
     "cut_patches",
     "default_settings",
     "distances_backward",
@@ -31,6 +34,9 @@ __all__ = [
     "terms_together",
     "terms_together_backward",
     "time_engine",
+    "times_empty",
+    "times_on",
+    "times_seen",
     "tree_backward",
     "tree_forward",
 ]
@@ -226,6 +232,66 @@ def distances_backward(
     state: DistanceState, arrays: _Distances, v_distances: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Flat gradients of points, rotations, centers and scale from those of the distances."""
+
+# Focal lengths and principal point, rotations [T, 9], centres [T, 3].
+_Poses = tuple[tuple[float, float, float, float], NDArray[np.float64], NDArray[np.float64]]
+
+def cone_distances(
+    silhouettes: NDArray[np.float32],
+    poses: _Poses,
+    points: NDArray[np.float64],
+    order: list[int],
+    agreeing: int,
+    stop: float,
+) -> NDArray[np.float64]:
+    """Distances [N] of points [N, 3] to the visual hull of silhouettes [T, H, W]."""
+
+def times_on(masks: NDArray[np.bool_], poses: _Poses, points: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """In how many pictures [N] points [N, 3] fall on true pixels of masks [T, H, W]."""
+
+def times_seen(
+    shown: NDArray[np.bool_],
+    poses: _Poses,
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    surface: NDArray[np.float64],
+    least_cosine: float,
+    tolerance: float,
+) -> NDArray[np.uint32]:
+    """In how many pictures [N] points [N, 3] of a surface show, given its normals and samples [M, 3]."""
+
+def times_empty(
+    shown: NDArray[np.bool_],
+    poses: _Poses,
+    points: NDArray[np.float64],
+    surface: NDArray[np.float64],
+    tolerance: float,
+) -> NDArray[np.uint32]:
+    """In how many pictures [N] points [N, 3] would hide surface [M, 3] that shows."""
+
+def beyond_planes(points: NDArray[np.float64], planes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The largest signed distance [N] of points [N, 3] to planes [M, 4]: normal and offset."""
+
+@final
+class SymmetryJudge:
+    """Judges symmetries of a surface. Opaque; symmetries are rows of a point and a direction."""
+
+    def __new__(
+        cls,
+        surface: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+        empty: NDArray[np.float64],
+        origin: tuple[float, ...],
+        spacing: float,
+        reach: float,
+        least_cosine: float,
+        turns: int,
+        every: int,
+    ) -> SymmetryJudge: ...
+    def agreement(self, axes: list[bool], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Support, contradiction and mean difference of colours, flat."""
+
+    def refined(self, axes: list[bool], rows: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+        """Points and directions of the symmetries moved to what they carry onto, flat."""
 
 def default_settings() -> dict[str, Any]:
     """The engine's own defaults, by the names of `RasterSettings`."""

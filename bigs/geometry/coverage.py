@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
-import torch
+
+import bigs.fused.shape as fused
 
 # Surface that is turned away further than this is seen at a glancing angle only, cosine.
 _LEAST_COSINE = 0.2
-# A sample also covers this many pixels of the depth buffer on either side, so that no gap shows what lies
-# behind.
-_CLOSED = 2
 
 
 @dataclass(frozen=True)
@@ -25,6 +20,11 @@ class ObjectViews:
     K: np.ndarray  # [3, 3] intrinsics
     rotations: np.ndarray  # [T, 3, 3]; x_cam = R x + centre
     centers: np.ndarray  # [T, 3] metres
+
+    @property
+    def poses(self) -> fused.Poses:
+        """The same as the compiled code has it."""
+        return fused.Poses(self.K, self.rotations, self.centers)
 
     def pixels(self, t: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Row, column [N] of the pixels of points [N, 3], their depths, and which are in the image."""
@@ -41,13 +41,6 @@ class ObjectViews:
         towards = -self.centers[t] @ self.rotations[t] - points
         return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
 
-    def nearest_depths(self, t: int, points: np.ndarray) -> np.ndarray:
-        """Depth buffer [H, W] of surface samples [N, 3]; infinite where there is none."""
-        row, column, depth, inside = self.pixels(t, points)
-        buffer = np.full(self.shown.shape[1:], np.inf)
-        np.minimum.at(buffer, (row[inside], column[inside]), depth[inside])
-        return scipy.ndimage.minimum_filter(buffer, 2 * _CLOSED + 1)
-
 
 def times_seen(
     views: ObjectViews, points: np.ndarray, normals: np.ndarray, surface: np.ndarray, tolerance: float
@@ -61,7 +54,7 @@ def times_seen(
         surface: [M, 3] dense samples of the whole surface, which may hide the points.
         tolerance: metres that a point may lie behind the nearest surface of its pixel.
     """
-    return _over_frames(views, points, lambda t: seen_in(views, t, points, normals, surface, tolerance))
+    return fused.times_seen(views.shown, views.poses, points, normals, surface, _LEAST_COSINE, tolerance)
 
 
 def seen_in(
@@ -73,39 +66,19 @@ def seen_in(
     tolerance: float,
 ) -> np.ndarray:
     """Which surface points [N] (bool) show in frame `t`; arguments as for `times_seen`."""
-    row, column, depth, inside = views.pixels(t, points)
-    cosine = (views.directions(t, points) * normals).sum(-1)
-    facing = cosine > _LEAST_COSINE
-    # The buffer holds the nearest depth of some pixels around, which on a slope is nearer than the point's
-    # own.
-    slope = np.sqrt(1.0 - cosine.clip(_LEAST_COSINE, 1.0) ** 2) / cosine.clip(_LEAST_COSINE, 1.0)
-    nearest = views.nearest_depths(t, surface)[row, column] + _CLOSED * depth / views.K[0, 0] * slope
-    return inside & facing & views.shown[t, row, column] & (depth < nearest + tolerance)
+    one = slice(t, t + 1)
+    frame = ObjectViews(views.shown[one], views.K, views.rotations[one], views.centers[one])
+    return times_seen(frame, points, normals, surface, tolerance) > 0
 
 
 def times_empty(views: ObjectViews, points: np.ndarray, surface: np.ndarray, tolerance: float) -> np.ndarray:
     """In how many frames [N] points [N, 3] would hide, by more than `tolerance`, surface [M, 3] that shows.
 
-    `surface` holds samples that the clip has seen, metres; what is in front of them cannot be there.
+    `surface` holds samples that the clip has seen, metres; what is in front of them cannot be there. A
+    surface that is seen from one side is unseen from the other; where only that side lies behind, nothing is
+    known.
     """
-
-    def hiding(t: int) -> np.ndarray:
-        row, column, depth, inside = views.pixels(t, points)
-        # A surface that is seen from one side is unseen from the other; if only that side lies behind,
-        # nothing is known.
-        nearest = views.nearest_depths(t, surface)[row, column]
-        return inside & views.shown[t, row, column] & np.isfinite(nearest) & (depth < nearest - tolerance)
-
-    return _over_frames(views, points, hiding)
-
-
-def _over_frames(views: ObjectViews, points: np.ndarray, holds: Callable[[int], np.ndarray]) -> np.ndarray:
-    """In how many frames [N] something holds of points [N, 3]; frames are looked at side by side."""
-    count = np.zeros(len(points), dtype=int)
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for of_frame in pool.map(holds, range(len(views.shown))):
-            count += of_frame
-    return count
+    return fused.times_empty(views.shown, views.poses, points, surface, tolerance)
 
 
 def sphere_directions(count: int) -> np.ndarray:

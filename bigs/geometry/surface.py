@@ -16,6 +16,8 @@ import scipy.sparse.csgraph
 import scipy.spatial
 import skimage.measure
 
+import bigs.fused.shape as fused
+
 
 @dataclass(frozen=True)
 class DistanceGrid:
@@ -115,42 +117,17 @@ class VisualHull:
             [N] metres, negative inside; a lower bound of the true distance outside. A point that
             fewer than `agreeing` frames see counts as inside by a large amount.
         """
-        height, width = self.silhouettes.shape[1:]
-        # The largest distances found so far, descending; the last one counts.
-        largest = np.full((self.agreeing, len(points)), -np.inf)
-        active = np.arange(len(points))
         # Neighbouring frames look from the same side, so that frames far apart settle more points sooner.
         apart = np.argsort(np.arange(len(self.silhouettes)) * _GOLDEN % 1.0, kind="stable")
-        for t in apart:
-            cam = points[active] @ self.rotations[t].T + self.centers[t]
-            u, v = self._pixels(cam)
-            seen = (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
-            pixels = scipy.ndimage.map_coordinates(
-                self.silhouettes[t], np.stack([v[seen], u[seen]]), order=1, prefilter=False
-            )
-            index = active[seen]
-            found = pixels * cam[seen, 2] / self.K[0, 0]
-            for rank in largest:
-                rank[index], found = np.maximum(rank[index], found), np.minimum(rank[index], found)
-            active = active[largest[-1, active] <= stop]
-        return np.where(np.isfinite(largest[-1]), largest[-1], -1.0)
+        return fused.cone_distances(self.silhouettes, self._poses, points, apart, self.agreeing, stop)
 
     def share_seen(self, points: np.ndarray, masks: np.ndarray) -> np.ndarray:
         """In what share [N] of the frames each point falls on a true pixel of `masks` [T, H, W] (bool)."""
-        height, width = masks.shape[1:]
-        count = np.zeros(len(points))
-        for mask, rotation, center in zip(masks, self.rotations, self.centers, strict=True):
-            u, v = self._pixels(points @ rotation.T + center)
-            column, row = np.rint(u), np.rint(v)
-            inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-            count[inside] += mask[row[inside].astype(int), column[inside].astype(int)]
-        return count / len(masks)
+        return fused.times_on(masks, self._poses, points) / len(masks)
 
-    def _pixels(self, cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Array coordinates (column, row) of camera points [N, 3]; NaN on and behind the camera."""
-        depth = np.where(cam[:, 2] > 1e-3, cam[:, 2], np.nan)
-        u = self.K[0, 0] * cam[:, 0] / depth + self.K[0, 2] - 0.5
-        return u, self.K[1, 1] * cam[:, 1] / depth + self.K[1, 2] - 0.5
+    @property
+    def _poses(self) -> fused.Poses:
+        return fused.Poses(self.K, self.rotations, self.centers)
 
     def outward(self, points: np.ndarray, step: float) -> np.ndarray:
         """Directions [N, 3] in which the hull's distance grows, by central differences of `step` metres."""
@@ -171,10 +148,7 @@ def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
 
 def distance_to_planes(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """The largest signed distance [N] of points [N, 3] to planes [M, 4]: unit normal and offset."""
-    largest = np.full(len(points), -np.inf)
-    for plane in planes:
-        np.maximum(largest, points @ plane[:3] + plane[3], out=largest)
-    return largest
+    return fused.beyond_planes(points, planes)
 
 
 def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12) -> np.ndarray:

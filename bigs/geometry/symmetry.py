@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy.ndimage
 import scipy.spatial
 from scipy.spatial.transform import Rotation
 
 # An axis of revolution is tested by rotations of these shares of a full turn.
-_TURNS = 12
+TURNS = 12
 
 
 class SeenSurface(NamedTuple):
@@ -29,6 +30,19 @@ class SeenSurface(NamedTuple):
 
 # Which of the points [N, 3] lie where the clip shows no object.
 IsEmpty = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class EmptySpace:
+    """Where the clip shows no object, by a grid that is above one half there; beyond it is none."""
+
+    values: np.ndarray  # [X, Y, Z]
+    origin: np.ndarray  # [3] position of values[0, 0, 0]
+    spacing: float  # metres between neighbours
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        place = ((points - self.origin) / self.spacing).T
+        return scipy.ndimage.map_coordinates(self.values, place, order=1, mode="constant", cval=1.0) > 0.5
 
 
 @dataclass(frozen=True)
@@ -46,7 +60,7 @@ class Symmetry:
         if self.kind == "plane":
             matrices = [np.eye(3) - 2.0 * np.outer(self.direction, self.direction)]
         else:
-            angles = np.arange(1, _TURNS) * (2.0 * np.pi / _TURNS)
+            angles = np.arange(1, TURNS) * (2.0 * np.pi / TURNS)
             matrices = list(Rotation.from_rotvec(angles[:, None] * self.direction).as_matrix())
         return [
             SeenSurface(

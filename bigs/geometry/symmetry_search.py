@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
-import scipy.spatial
 
+from bigs.fused.shape import SymmetryJudge
 from bigs.geometry.coverage import sphere_directions
-from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry import TURNS, EmptySpace, SeenSurface, Symmetry, completed
 
-# Number of candidates that are refined, of those that are polished, of rounds, and of samples that vote.
+# Number of candidates that are refined, of those that are polished, and of samples that vote.
 _FINALISTS = 14
 _POLISHED = 4
-_ROUNDS = 6
 _VOTERS = 400
+# Of the many turns about an axis every eighth sample will do.
+_EVERY = 8
 # Cosine of 35 degrees.
 _LEAST_COSINE = 0.82
 # Most symmetries that are searched: three planes fill every octant.
@@ -50,7 +53,7 @@ class SymmetryConfig:
 
 
 def find_symmetries(
-    surface: SeenSurface, is_empty: IsEmpty, config: SymmetryConfig = SymmetryConfig()
+    surface: SeenSurface, is_empty: EmptySpace, config: SymmetryConfig = SymmetryConfig()
 ) -> list[Symmetry]:
     """The symmetries with strong evidence, in the order in which they were found; often none.
 
@@ -59,7 +62,7 @@ def find_symmetries(
 
     Args:
         surface: what was seen, at least a few hundred samples.
-        is_empty: see `IsEmpty`.
+        is_empty: where nothing is.
         config: what counts as strong.
     """
     found: list[Symmetry] = []
@@ -75,59 +78,65 @@ def find_symmetries(
     return found
 
 
+class _Agreement(NamedTuple):
+    """What speaks for a symmetry and against it."""
+
+    support: float  # share of what is carried
+    contradiction: float  # likewise
+    color: float  # the colours' error relative to chance
+
+
 class _Judge:
     """Scores symmetries against what was seen."""
 
-    def __init__(self, surface: SeenSurface, is_empty: IsEmpty, config: SymmetryConfig) -> None:
-        self.surface = surface
-        self.is_empty = is_empty
+    def __init__(self, surface: SeenSurface, is_empty: EmptySpace, config: SymmetryConfig) -> None:
         self.config = config
         self.size = float(np.ptp(surface.points, axis=0).max())
         self.tolerance = config.tolerance * self.size
-        self.tree = scipy.spatial.cKDTree(surface.points)
         middle = np.median(surface.colors, axis=0)
         # Difference of two random colours of the surface; never so small that noise decides.
         self.chance = max(1.4 * float(np.abs(surface.colors - middle).mean()), 0.02)
+        self.compiled = SymmetryJudge(
+            surface,
+            is_empty.values,
+            is_empty.origin,
+            is_empty.spacing,
+            self.tolerance,
+            _LEAST_COSINE,
+            TURNS,
+            _EVERY,
+        )
 
-    def images(self, symmetry: Symmetry) -> list[SeenSurface]:
-        """What is carried; of the many turns about an axis every eighth sample will do."""
-        every = 8 if symmetry.kind == "axis" else 1
-        return symmetry.images(SeenSurface(*(values[::every] for values in self.surface)))
+    def agreement(self, symmetries: Sequence[Symmetry]) -> list[_Agreement]:
+        """What speaks for each symmetry and against it."""
+        found = self.compiled.agreement(
+            [symmetry.kind == "axis" for symmetry in symmetries], _rows(symmetries)
+        )
+        return [
+            _Agreement(support, contradiction, error / self.chance if support > 0.0 else np.inf)
+            for support, contradiction, error in found.tolist()
+        ]
 
-    def matches(self, image: SeenSurface, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Which carried points meet seen surface within `reach`, and which points they meet: indices [M]."""
-        distance, index = self.tree.query(image.points, distance_upper_bound=reach)
-        near = np.flatnonzero(np.isfinite(distance))
-        same_way = (image.normals[near] * self.surface.normals[index[near]]).sum(-1) > _LEAST_COSINE
-        return near[same_way], index[near[same_way]]
+    def worths(self, symmetries: Sequence[Symmetry]) -> list[float]:
+        return [found.support - 3.0 * found.contradiction for found in self.agreement(symmetries)]
 
-    def agreement(self, symmetry: Symmetry) -> tuple[float, float, float]:
-        """Support and contradiction as shares of what is carried; the colours' error relative to chance."""
-        support, contradiction, errors = [], [], []
-        for image in self.images(symmetry):
-            carried, met = self.matches(image, self.tolerance)
-            rest = np.ones(len(image.points), dtype=bool)
-            rest[carried] = False
-            support.append(len(carried) / len(rest))
-            contradiction.append(self.is_empty(image.points[rest]).sum() / len(rest))
-            errors.append(np.abs(image.colors[carried] - self.surface.colors[met]).mean(-1))
-        error = np.concatenate(errors)
-        color = float(error.mean()) / self.chance if len(error) else np.inf
-        return float(np.mean(support)), float(np.mean(contradiction)), color
-
-    def worth(self, symmetry: Symmetry) -> float:
-        support, contradiction, _ = self.agreement(symmetry)
-        return support - 3.0 * contradiction
+    def ranked(self, symmetries: Sequence[Symmetry]) -> list[Symmetry]:
+        """The same, best first."""
+        order = np.argsort(-np.array(self.worths(symmetries)), kind="stable")
+        return [symmetries[index] for index in order]
 
     def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
         """The refined candidate that agrees best; None if that is not enough."""
-        ranked = sorted(candidates, key=self.worth, reverse=True)[:_FINALISTS]
+        if not candidates:
+            return None
         refined: list[Symmetry] = []
-        for symmetry in sorted(map(self._refined, ranked), key=self.worth, reverse=True):
+        for symmetry in self.ranked(self._refined(self.ranked(candidates)[:_FINALISTS])):
             if not any(_alike(symmetry, other, self.size) for other in (*known, *refined)):
                 refined.append(symmetry)
-        for symmetry in sorted(map(self._polished, refined[:_POLISHED]), key=self.worth, reverse=True):
-            support, contradiction, color = self.agreement(symmetry)
+        polished = [self._polished(symmetry) for symmetry in refined[:_POLISHED]]
+        for symmetry in self.ranked(polished) if polished else []:
+            (found,) = self.agreement([symmetry])
+            support, contradiction = found.support, found.contradiction
             most = self.config.most_contradiction
             if (
                 not any(_alike(symmetry, other, self.size) for other in known)
@@ -135,43 +144,28 @@ class _Judge:
                 and support >= self.config.least_support
                 and contradiction <= max(most, self.config.contradiction_per_support * support)
                 and support >= self.config.least_share * (support + contradiction)
-                and color <= self.config.most_color_error
+                and found.color <= self.config.most_color_error
                 and self._sharpness(symmetry) >= self.config.least_sharpness
             ):
                 return replace(symmetry, support=support, contradiction=contradiction)
         return None
 
-    def _refined(self, symmetry: Symmetry) -> Symmetry:
-        """The symmetry moved to where the carried points lie on the planes of those they meet."""
-        for reach in np.geomspace(4.0, 1.5, _ROUNDS) * self.tolerance:
-            pairs = [self.matches(image, reach) for image in self.images(symmetry)]
-            if sum(len(carried) for carried, _ in pairs) < 30:
-                break
-            start = symmetry
+    def _refined(self, symmetries: Sequence[Symmetry]) -> list[Symmetry]:
+        """The symmetries moved to where the carried points lie on the planes of those they meet.
 
-            def off_plane(x: np.ndarray, start: Symmetry = start, pairs: list = pairs) -> np.ndarray:
-                return np.concatenate(
-                    [
-                        ((image.points[carried] - self.surface.points[met]) * self.surface.normals[met]).sum(
-                            -1
-                        )
-                        for image, (carried, met) in zip(
-                            self.images(start.moved(x, self.size)), pairs, strict=True
-                        )
-                    ]
-                )
-
-            step = scipy.optimize.least_squares(
-                off_plane, np.zeros(4), loss="soft_l1", f_scale=0.5 * self.tolerance, max_nfev=4
-            )
-            symmetry = start.moved(step.x, self.size)
-        return symmetry
+        One stays where that is no gain: on a flat side most points lie on the planes of others anyhow.
+        """
+        axes = [symmetry.kind == "axis" for symmetry in symmetries]
+        rows = self.compiled.refined(axes, _rows(symmetries), self.size)
+        moved = [Symmetry(old.kind, row[:3], row[3:]) for old, row in zip(symmetries, rows, strict=True)]
+        better = np.array(self.worths(moved)) > self.worths(symmetries)
+        return [new if gain else old for old, new, gain in zip(symmetries, moved, better, strict=True)]
 
     def _polished(self, symmetry: Symmetry) -> Symmetry:
         """The symmetry moved a little to where it agrees best."""
         simplex = np.vstack([np.zeros(4), np.diag([0.02, 0.02, 0.06, 0.06])])
         found = scipy.optimize.minimize(
-            lambda x: -self.worth(symmetry.moved(x, self.size)),
+            lambda x: -self.worths([symmetry.moved(x, self.size)])[0],
             np.zeros(4),
             method="Nelder-Mead",
             options={"maxfev": 60, "initial_simplex": simplex},
@@ -185,7 +179,13 @@ class _Judge:
         if symmetry.kind == "axis":
             moves.append((shift, 0.0, 0.0, 0.0))
         tried = [symmetry.moved(sign * np.array(move), self.size) for move in moves for sign in (1.0, -1.0)]
-        return self.worth(symmetry) - max(map(self.worth, tried))
+        own, *others = self.worths([symmetry, *tried])
+        return own - max(others)
+
+
+def _rows(symmetries: Sequence[Symmetry]) -> np.ndarray:
+    """Points and directions [M, 6]."""
+    return np.array([[*symmetry.point, *symmetry.direction] for symmetry in symmetries])
 
 
 def _alike(a: Symmetry, b: Symmetry, size: float) -> bool:

@@ -8,7 +8,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from bigs.geometry.mesh import sample_surface
-from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.surface import distance_to_planes, empty_grid
+from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import find_symmetries
 
 # Where the camera stands, as seen from the object: three faces of a box show.
@@ -24,12 +25,14 @@ def seen_of(mesh: trimesh.Trimesh, color_axis: int = 2) -> tuple[SeenSurface, np
     return SeenSurface(noisy[shown], normals[shown], colors[shown]), points
 
 
-def outside(mesh: trimesh.Trimesh) -> IsEmpty:
+def outside(mesh: trimesh.Trimesh) -> EmptySpace:
     """What silhouettes all around would say: whatever is outside the convex hull is empty."""
     hull = trimesh.convex.convex_hull(mesh)
     origins, normals = hull.triangles_center, hull.face_normals
-    offsets = (origins * normals).sum(-1)
-    return lambda points: (points @ normals.T - offsets).max(-1) > 0.004
+    planes = np.concatenate([normals, -(origins * normals).sum(-1, keepdims=True)], axis=1)
+    grid = empty_grid(hull.bounds[0] - 0.02, hull.bounds[1] + 0.02, 100)
+    empty = distance_to_planes(grid.points(), planes) > 0.004
+    return EmptySpace(empty.reshape(grid.values.shape).astype(float), grid.origin, grid.spacing)
 
 
 def missing(points: np.ndarray, truth: np.ndarray) -> float:
@@ -116,4 +119,5 @@ def test_colours_can_speak_against_a_plane() -> None:
 
 def test_too_little_was_seen() -> None:
     few = SeenSurface(np.random.default_rng(0).normal(size=(50, 3)), np.eye(3)[[0] * 50], np.zeros((50, 3)))
-    assert find_symmetries(few, lambda points: np.zeros(len(points), dtype=bool)) == []
+    nowhere = EmptySpace(np.zeros((2, 2, 2)), np.full(3, -10.0), 20.0)
+    assert find_symmetries(few, nowhere) == []

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.ndimage
 import scipy.spatial
 
 from bigs.geometry.coverage import times_empty
 from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid
-from bigs.geometry.symmetry import IsEmpty, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import find_symmetries
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.initial import ObjectStart
@@ -84,7 +83,7 @@ def complete(
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 
 
-def _empty_space(hull: ObjectHull, surface: SeenSurface, config: InitialConfig) -> IsEmpty:
+def _empty_space(hull: ObjectHull, surface: SeenSurface, config: InitialConfig) -> EmptySpace:
     """Where the clip shows that there is no object: outside the silhouettes, or before what was seen."""
     grid = hull.grid
     corners = grid.points()
@@ -93,10 +92,4 @@ def _empty_space(hull: ObjectHull, surface: SeenSurface, config: InitialConfig) 
     empty = np.ones(len(corners))
     before = times_empty(hull.views, corners[near], surface.points, config.seen_tolerance)
     empty[near] = (outside[near] > _OUTSIDE * config.seen_tolerance) | (before >= config.seen_frames)
-    volume = empty.reshape(grid.values.shape)
-
-    def is_empty(points: np.ndarray) -> np.ndarray:
-        place = ((points - grid.origin) / grid.spacing).T
-        return scipy.ndimage.map_coordinates(volume, place, order=1, mode="constant", cval=1.0) > 0.5
-
-    return is_empty
+    return EmptySpace(empty.reshape(grid.values.shape), grid.origin, grid.spacing)

@@ -6,6 +6,7 @@ mod pixels;
 mod pose;
 mod poses;
 mod sh;
+mod shape;
 mod track;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -336,6 +337,12 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(pixels::terms_alone_backward, m)?)?;
     m.add_function(wrap_pyfunction!(track::cut_patches, m)?)?;
     m.add_function(wrap_pyfunction!(track::lay_patches, m)?)?;
+    m.add_class::<shape::SymmetryJudge>()?;
+    m.add_function(wrap_pyfunction!(shape::cone_distances, m)?)?;
+    m.add_function(wrap_pyfunction!(shape::times_on, m)?)?;
+    m.add_function(wrap_pyfunction!(shape::times_seen, m)?)?;
+    m.add_function(wrap_pyfunction!(shape::times_empty, m)?)?;
+    m.add_function(wrap_pyfunction!(shape::beyond_planes, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
     m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }
