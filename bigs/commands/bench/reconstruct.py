@@ -22,7 +22,7 @@ from bigs.commands.bench.growth import measure, probes
 from bigs.commands.clips.open import open_estimates
 from bigs.commands.clips.truth import find_ground_truth
 from bigs.commands.folder.contents import write_json
-from bigs.commands.run.series import PlannedRun, check_folders, run_or_reuse
+from bigs.commands.run.series import TIMES, PlannedRun, check_folders, run_or_reuse
 from bigs.data.ground_truth import load_ground_truth
 from bigs.files import read_json
 from bigs.hand import load_hand_models
@@ -125,7 +125,7 @@ def clip_names(clips: tuple[Path, ...]) -> list[str]:
 def bench_reconstruct(
     plan: RunPlan, out: Path, *, picture: bool = True, listen: Callable[[str], None] = lambda text: None
 ) -> RunBench:
-    """Measure into a folder; runs of an earlier call are kept.
+    """Measure into a folder; runs of an earlier call are kept, and stay in tables and picture.
 
     Args:
         plan: what to run.
@@ -178,6 +178,7 @@ def bench_reconstruct(
         "runs": [],
         "growth": [],
     }
+    _add_earlier_runs(report, out, {run.folder for _, _, run in planned})
     tables: list[Table] = []
     for name, variant, run in planned:
         run.folder.parent.mkdir(exist_ok=True)
@@ -185,6 +186,7 @@ def bench_reconstruct(
         report["runs"].append(
             {
                 "clip": name,
+                "folder": variant.folder,
                 "label": variant.label,
                 "preset": variant.preset,
                 "off": variant.off,
@@ -220,6 +222,21 @@ def bench_reconstruct(
             report["growth"].append({"axis": probe.axis, "value": probe.value, **found})
             tables = _write(out, report)
     return RunBench(tables, [f"{r['clip']}: {r['label']}" for r in report["runs"] if r["failure"]])
+
+
+def _add_earlier_runs(report: dict[str, Any], out: Path, planned: set[Path]) -> None:
+    """Add finished runs of earlier calls with this version that are not `planned` now, and their clips."""
+    try:
+        stored = read_json(out / NUMBERS)
+    except InputError:
+        return
+    if stored["bigs"] != bigs.__version__:
+        return
+    for run in stored["runs"]:
+        folder = out / run["clip"] / run["folder"]
+        if folder not in planned and not run["failure"] and (folder / TIMES).exists():
+            report["runs"].append(run)
+            report["clips"].setdefault(run["clip"], stored["clips"][run["clip"]])
 
 
 def _stored(path: Path, key: dict[str, Any]) -> dict[str, Any] | None:

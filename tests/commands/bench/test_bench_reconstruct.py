@@ -155,6 +155,28 @@ def test_runs_and_probes_are_kept(
     assert "frames 5" in probed
 
 
+def test_runs_of_earlier_calls_stay_in_the_tables(
+    runs: FakeRuns, two_clips: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+
+    def listed(plan: RunPlan) -> list[tuple[str, str]]:
+        bench_reconstruct(plan, out, picture=False)
+        numbers = json.loads((out / "reconstruct.json").read_text())
+        assert set(numbers["clips"]) >= {run["clip"] for run in numbers["runs"]}
+        return [(run["clip"], run["label"]) for run in numbers["runs"]]
+
+    smoke = RunPlan(two_clips, ("smoke",), growth_steps=0)
+    assert listed(smoke) == [("clip", "smoke"), ("other", "smoke")]
+    share = replace(smoke, clips=two_clips[:1], without=("share",))
+    assert listed(share) == [("other", "smoke"), ("clip", "smoke"), ("clip", "smoke without share")]
+    # A folder that was removed is no run any more, and one that failed never was.
+    shutil.rmtree(out / "other")
+    runs.fail = "smoke-without-contact"
+    assert ("clip", "smoke without contact") in listed(replace(share, without=("contact",)))
+    assert listed(replace(share, without=())) == [("clip", "smoke without share"), ("clip", "smoke")]
+
+
 def test_what_the_command_line_says(
     runs: FakeRuns, call: Callable[..., Answer], two_clips: tuple[Path, Path], tmp_path: Path
 ) -> None:
