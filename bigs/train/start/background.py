@@ -1,10 +1,14 @@
 """Background pixels that show unlabelled occluders: sleeves, arms, other people.
 
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
-background is the same in every frame, so whatever differs from its median over time is an unknown occluder.
+background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
+most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
+colours, the one that the clip's occluders have elsewhere belongs to an occluder.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -17,6 +21,13 @@ from bigs.data.base import Clip
 _THRESHOLD = 0.06
 # Long side in pixels at which frames are compared: occluders are large, and a clip then fits in memory.
 _SIZE = 320
+# A pixel that shows something else in this share of its frames may show an occluder in most of them.
+_CONTESTED_SHARE = 0.05
+# How colours of occluders and background are counted: cells along each channel, and rounds of counting and
+# deciding. Neighbours within some compared pixels decide together.
+_COLOR_CELLS = 16
+_ROUNDS = 8
+_NEIGHBOURHOOD = 2.0
 # Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
 # If more of the background moves than this, the camera moves or the light changes, and nothing is known.
@@ -32,13 +43,12 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     images = np.stack([clip.image(t)[::step, ::step] for t in range(len(clip))])
     background = np.stack([clip.mask(t)[::step, ::step] for t in range(len(clip))]) == 0
-    unknown = np.zeros(background.shape, dtype=bool)
-    for row in range(images.shape[1]):  # a row at a time: the median's copy in floats is large
-        values = np.where(background[:, row, :, None], images[:, row] / np.float32(255.0), np.float32(np.nan))
-        seen = background[:, row].any(axis=0)
-        median = np.zeros(values.shape[1:], dtype=np.float32)
-        median[seen] = np.nanmedian(values[:, seen], axis=0)
-        unknown[:, row] = (np.abs(values - median) > _THRESHOLD).any(axis=-1) & background[:, row]
+    still = _still_background(_looks(images, background))
+    # A frame at a time: the whole clip in floats is large.
+    unknown = (
+        np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
+        & background
+    )
     if unknown.sum() > _USELESS_SHARE * background.sum():
         return np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     # Mask borders mix two colours in one pixel; an occluder is wider than that.
@@ -52,6 +62,91 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     near = scipy.ndimage.binary_dilation(unknown, cross, iterations=2 * _CLOSE)
     unknown |= closed & near & background
     return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+
+
+class _Looks(NamedTuple):
+    """What each pixel shows where the masks say background; colours in [0, 1]."""
+
+    usual: np.ndarray  # [H, W, 3] median over time
+    other: np.ndarray  # [H, W, 3] median over the frames that differ from it
+    usual_frames: np.ndarray  # [H, W] number of frames that show the usual colour
+    other_frames: np.ndarray  # [H, W] number of the others
+
+
+def _floats(image: np.ndarray) -> np.ndarray:
+    return image / np.float32(255.0)
+
+
+def _looks(images: np.ndarray, background: np.ndarray) -> _Looks:
+    """The looks of images [T, H, W, 3] where the masks say background [T, H, W]."""
+    usual, other = np.zeros((2, *images.shape[1:]), dtype=np.float32)
+    differs = np.zeros(background.shape, dtype=bool)
+    for row in range(images.shape[1]):  # a row at a time: the medians' copies in floats are large
+        values = np.where(background[:, row, :, None], _floats(images[:, row]), np.float32(np.nan))
+        usual[row] = _median(values)
+        differs[:, row] = (np.abs(values - usual[row]) > _THRESHOLD).any(axis=-1)
+        other[row] = _median(np.where(differs[:, row, :, None], values, np.float32(np.nan)))
+    other_frames = differs.sum(axis=0)
+    return _Looks(usual, other, background.sum(axis=0) - other_frames, other_frames)
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Median [W, 3] over time of values [T, W, 3] without those that are NaN; 0 where all are."""
+    median = np.zeros(values.shape[1:], dtype=values.dtype)
+    seen = ~np.isnan(values[..., 0]).all(axis=0)
+    median[seen] = np.nanmedian(values[:, seen], axis=0)
+    return median
+
+
+def _still_background(looks: _Looks) -> np.ndarray:
+    """Colour [H, W, 3] of the background: of each pixel's two looks the one that is less like an occluder.
+
+    An occluder that moves has the same colours in many places, the background each of its colours in its own.
+    So colours are counted, for occluders at first in the rarer looks and for the background in the usual
+    ones; contested pixels then choose, and colours are counted again.
+    """
+    usual, other, usual_frames, other_frames = looks
+    contested = other_frames > _CONTESTED_SHARE * (usual_frames + other_frames)
+    swapped = np.zeros(contested.shape, dtype=bool)
+    area = _smoothed(contested.astype(np.float64))
+    # What is seen more often is more likely the background.
+    odds = np.log((usual_frames + 1) / (other_frames + 1))
+    for _ in range(_ROUNDS if contested.any() else 0):
+        still, moving = np.where(swapped[..., None], (other, usual), (usual, other))
+        still_frames, moving_frames = np.where(
+            swapped, (other_frames, usual_frames), (usual_frames, other_frames)
+        )
+        of_background = _color_counts(still, still_frames)
+        of_occluders = _color_counts(moving, np.where(contested, moving_frames, 0))
+        gain = odds + _log_ratio(other, of_occluders, of_background)
+        gain -= _log_ratio(usual, of_occluders, of_background)
+        gain = _smoothed(np.where(contested, gain, 0.0)) / np.maximum(area, 1e-3)
+        before, swapped = swapped, contested & (gain < 0.0)
+        if (swapped == before).all():
+            break
+    return np.where(swapped[..., None], other, usual)
+
+
+def _log_ratio(colors: np.ndarray, counts: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Logarithm [H, W] of how much more often colours [H, W, 3] were counted than in the other histogram."""
+    cells = _cells(colors)
+    return np.log1p(counts[cells]) - np.log1p(others[cells])
+
+
+def _smoothed(values: np.ndarray) -> np.ndarray:
+    return scipy.ndimage.gaussian_filter(values, _NEIGHBOURHOOD)
+
+
+def _cells(colors: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The cells of the colour histogram that colours [..., 3] fall into, an index array for each channel."""
+    return tuple(np.moveaxis((colors * _COLOR_CELLS).astype(int).clip(0, _COLOR_CELLS - 1), -1, 0))
+
+
+def _color_counts(colors: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """How many frames [H, W] show each colour [H, W, 3], as a smooth histogram [cells, cells, cells]."""
+    counts = np.zeros((_COLOR_CELLS,) * 3)
+    np.add.at(counts, _cells(colors), frames)
+    return scipy.ndimage.gaussian_filter(counts, 1.0, mode="constant")
 
 
 def share_per_pixel(masks: np.ndarray, height: int, width: int) -> torch.Tensor:

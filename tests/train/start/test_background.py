@@ -53,6 +53,26 @@ def test_finds_a_moving_sleeve(tmp_path: Path, rng: np.random.Generator) -> None
     assert found[~near].mean() < 0.005
 
 
+def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A forearm that stays for two thirds of the time is no background, and what it hides then is."""
+    sleeve = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=bool)
+    sleeve[: 2 * FRAMES // 3, 20:36, 8:38] = True
+    hand = np.zeros_like(sleeve)
+    hand[:, 26:32, 4:8] = True
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[hand] = [0.8, 0.6, 0.5]
+    images[sleeve] = [0.1, 0.15, 0.9]
+    # An arm in the same sleeve that moves.
+    for t in range(FRAMES):
+        images[t, 44:58, 4 * t : 4 * t + 16] = [0.1, 0.15, 0.9]
+        sleeve[t, 44:58, 4 * t : 4 * t + 16] = True
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    found = unknown_occluders(clip)
+    assert found[sleeve].mean() > 0.95
+    near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
+    assert found[~near].mean() < 0.02
+
+
 def test_a_still_clip_has_none(tmp_path: Path, rng: np.random.Generator) -> None:
     hand = moving_box(25, 5, 12, 12, 5)
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
