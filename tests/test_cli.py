@@ -157,7 +157,7 @@ def test_ingredients_are_left_out(
         ("raster.eps2d=wide", ["--set raster.eps2d", "expected float", "'wide'"]),
         ("raster.eps2d=[", ["--set raster.eps2d=["]),
         ("raster.eps2d=-1", ["eps2d", "expected", "found -1"]),
-        ("raster.tile_size=12", ["tile_size", "expected 4, 8 or 16", "found 12"]),
+        ("raster.tile_size=12", ["tile_size", "expected 4, 8, 16 or 32", "found 12"]),
         ("raster.exp_degree=6", ["exp_degree", "expected 3, 4 or 5", "found 6"]),
         ("stages.joint.weights.typo=1", ["joint", "expected one of", "found 'typo'"]),
         (

@@ -39,7 +39,7 @@ SETTINGS: tuple[Point, ...] = (
     ),
     *_points("min_transmittance", {"0": 0.0, "1e-5": 1e-5, "1e-4": 1e-4, "1e-3": 1e-3, "1e-2": 1e-2}),
     *_points("exp_degree", {"3": 3, "4": 4, "5": 5}),
-    *_points("tile_size", {"4": 4, "8": 8, "16": 16}),
+    *_points("tile_size", {"4": 4, "8": 8, "16": 16, "32": 32}),
     *_points("dtype", {"float32": "float32", "float64": "float64"}),
 )
 

@@ -12,6 +12,10 @@ import torch
 from bigs.checks import InputError
 from bigs.raster.settings import RasterSettings
 
+# A pixel of a tile is a thread there, and more of them than this leave each too few registers. No result
+# depends on tiles.
+_LARGEST_TILE = 16
+
 # Constants of gsplat's kernels.
 _FIXED = ("alpha_threshold", "max_alpha", "min_transmittance", "exp_degree")
 
@@ -62,7 +66,7 @@ def rasterize(
         far_plane=settings.far_plane,
         radius_clip=settings.radius_clip,
         eps2d=settings.eps2d,
-        tile_size=settings.tile_size,
+        tile_size=min(settings.tile_size, _LARGEST_TILE),
         rasterize_mode="antialiased" if settings.antialiased else "classic",
         render_mode=render_mode,
         camera_model=camera_model,

@@ -20,7 +20,7 @@ from bigs.train.plan.densify_config import DensifyConfig
 from bigs.train.plan.ranges import check_ranges
 
 # The settings that the renderer is compiled for.
-COMPILED = {"tile_size": (4, 8, 16), "exp_degree": (3, 4, 5)}
+COMPILED = {"tile_size": (4, 8, 16, 32), "exp_degree": (3, 4, 5)}
 
 
 def check_plan(config: RunConfig) -> None:

@@ -72,7 +72,7 @@ def mixture(seed: int) -> tuple[dict[str, Any], RasterSettings]:
     if dice.one_of(False, True):
         inputs["backgrounds"] = dice.uniform(1, channels)
     settings = RasterSettings(
-        tile_size=dice.one_of(16, 8, 4),
+        tile_size=dice.one_of(32, 16, 8, 4),
         eps2d=dice.one_of(0.3, 0.05, 0.0),
         near_plane=0.01 * unit,
         max_alpha=dice.one_of(0.999, 0.7),

@@ -119,7 +119,7 @@ def test_cameras_are_named():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"tile_size": 12}, "settings.tile_size: expected 4, 8 or 16"),
+        ({"tile_size": 12}, "settings.tile_size: expected 4, 8, 16 or 32"),
         ({"exp_degree": 2}, "settings.exp_degree: expected 3, 4 or 5"),
         ({"exp_degree": 4}, "settings.exp_degree: expected 5 with 64-bit floats"),
         ({"max_alpha": 1.0}, r"settings.max_alpha: expected a number in \(0, 1\)"),
@@ -201,7 +201,7 @@ def test_tiles_without_gradient_are_skipped_and_counted():
     inputs["means"].requires_grad_()
     colors, _, info = rasterization(**inputs)
     colors[0, :16].sum().backward()
-    assert info["n_tiles_without_gradient"] == 16 - info["n_empty_tiles"] - 4
+    assert info["n_tiles_without_gradient"] == 4 - info["n_empty_tiles"] - 2
 
 
 def test_saturated_pixels_are_counted():
@@ -228,7 +228,7 @@ def test_skipped_gradients_are_named():
 def test_unpacks_as_three_values():
     colors, alphas, info = rasterization(**scene(cameras=2))
     assert colors.shape == (2, 18, 23, 3) and alphas.shape == (2, 18, 23, 1)
-    assert info["n_isects"] > 0 and info["tile_size"] == 16
+    assert info["n_isects"] > 0 and info["tile_size"] == 32
 
 
 def test_arrays_in_fortran_order_are_refused(monkeypatch):

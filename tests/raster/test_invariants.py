@@ -29,7 +29,7 @@ doubles = st.builds(
 )
 rules = st.builds(
     RasterSettings,
-    tile_size=st.sampled_from([4, 8, 16]),
+    tile_size=st.sampled_from([4, 8, 16, 32]),
     eps2d=st.sampled_from([0.3, 0.01]),
     alpha_threshold=st.sampled_from([1 / 255, 0.0, 0.05]),
     max_alpha=st.sampled_from([0.999, 0.6]),
@@ -92,7 +92,7 @@ def test_gradients_move_with_the_world(inputs, seed):
 def test_tiles_are_invisible(inputs, rule):
     images = [
         gradients(inputs, settings=RasterSettings(**{**rule.__dict__, "tile_size": size}))
-        for size in (4, 8, 16)
+        for size in (4, 8, 16, 32)
     ]
     tolerance = 1e-4 if inputs["means"].dtype == torch.float32 else 1e-11
     for colors, alphas, grads in images[1:]:
@@ -253,7 +253,7 @@ def every_pair(inputs, rule):
     return torch.from_numpy(weights), torch.from_numpy(raw)
 
 
-@pytest.mark.parametrize("tile_size", [4, 8, 16])
+@pytest.mark.parametrize("tile_size", [4, 8, 16, 32])
 @pytest.mark.parametrize("seed", range(4))
 def test_culling_drops_no_pair(seed, tile_size):
     inputs = scene(n=40, width=37, height=29, seed=seed, spread=[0.35, 0.05, 0.8, 0.35][seed])

@@ -82,7 +82,7 @@ def test_antialiased(size, dtype):
     compare(inputs, settings=RasterSettings(antialiased=True, alpha_threshold=1e-4))
 
 
-@pytest.mark.parametrize("tile_size", [4, 8, 16])
+@pytest.mark.parametrize("tile_size", [4, 8, 16, 32])
 def test_tile_sizes_and_no_cutoffs(tile_size):
     settings = RasterSettings(tile_size=tile_size, alpha_threshold=0.0, min_transmittance=0.0)
     compare(scene(n=40, width=33, height=19), settings=settings)

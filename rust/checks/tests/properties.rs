@@ -125,8 +125,8 @@ proptest! {
             let settings = RasterSettings { tile_size, ..Default::default() };
             render(&scene, VIEWMAT, &settings, None)
         };
-        let (colors, alphas, _) = image(16);
-        for tile_size in [4, 8] {
+        let (colors, alphas, _) = image(32);
+        for tile_size in [4, 8, 16] {
             let other = image(tile_size);
             prop_assert!(other.0 == colors && other.1 == alphas);
         }

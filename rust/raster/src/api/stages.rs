@@ -13,7 +13,7 @@ use crate::lists::tile_lists::{ListScratch, TileLists};
 use crate::memory::pool::Pooled;
 use crate::memory::results::filled_with;
 use crate::pipeline::scalar::Scalar;
-use crate::pipeline::view::{View, scene};
+use crate::pipeline::view::{View, channels_of, scene};
 use crate::project::projected::Projected;
 use crate::project::splat::ScreenInfo;
 use crate::project::tiles::TileGrid;
@@ -77,6 +77,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
         T::project(
             &mut projected,
             &view.gaussians,
+            channels_of(&view.gaussians, mode),
             &view.camera,
             &limits,
             &grid,
@@ -122,6 +123,7 @@ impl<'a, T: Scalar> Stages<'a, T> {
         T::project(
             &mut self.projected,
             &self.view.gaussians,
+            channels_of(&self.view.gaussians, self.mode),
             &self.view.camera,
             &self.limits,
             &self.grid,

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 
 use crate::backproject::dispatch;
 use crate::backproject::sum_tiles::{PacketIntersections, ScreenGradients};
-use crate::composite::kernel::Channels;
 use crate::input::camera::Camera;
+use crate::input::channels::Channels;
 use crate::input::gaussians::Gaussians;
 use crate::input::settings::Limits;
 use crate::math::real::Real;

@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use crate::composite::intersection_gradients::gradient_size;
-use crate::composite::kernel::{ABSOLUTES, Channels, LANES, MOMENTS};
+use crate::composite::kernel::{ABSOLUTES, LANES, MOMENTS};
+use crate::input::channels::Channels;
 use crate::math::real::Real;
 use crate::project::packet::{PacketGradients, is_sound};
 use crate::project::splat::Splat;

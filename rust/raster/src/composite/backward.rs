@@ -12,7 +12,7 @@ use crate::composite::kernel::{
 };
 use crate::composite::scene::Scene;
 use crate::math::real::Real;
-use crate::memory::pool::Pooled;
+use crate::memory::pool::{Buffers, Pooled, bytes_of};
 use crate::memory::shared_slice::{OwnPieces, Scattered};
 use crate::simd::Vectors;
 use crate::simd::level::{Simd, Work};
@@ -50,7 +50,7 @@ pub(crate) fn composite_vjp<T: Vectors>(
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
     backgrounds.par_chunks_mut(total).enumerate().for_each_init(
-        Incoming::new,
+        Incoming::pooled,
         |incoming, (tile, v_background)| {
             let mut task = scene.task(tile);
             if task.entries.is_empty() {
@@ -233,16 +233,43 @@ impl<T: Real> Work for Load<'_, T> {
 
 /// The incoming gradients of one tile, for one group of channels.
 struct Incoming<T> {
-    v_values: [TilePlane<T>; MAX_CHANNELS],
+    /// One plane per channel. A kernel may have more channels than are left, and finds zeros there.
+    v_values: Vec<TilePlane<T>>,
+    /// Planes beyond so many are zero.
+    used: usize,
     v_transmittance: TilePlane<T>,
 }
 
-impl<T: Real> Incoming<T> {
-    fn new() -> Self {
+impl<T: Real> Default for Incoming<T> {
+    fn default() -> Self {
         Self {
-            v_values: [[Lanes::ZERO; MAX_BLOCKS]; MAX_CHANNELS],
+            v_values: Vec::new(),
+            used: 0,
             v_transmittance: [Lanes::ZERO; MAX_BLOCKS],
         }
+    }
+}
+
+impl<T: Real> Buffers for Incoming<T> {
+    fn bytes(&self) -> usize {
+        size_of::<Self>() + bytes_of(&self.v_values)
+    }
+}
+
+impl<T: Real> Incoming<T> {
+    fn pooled() -> Pooled<Self> {
+        let mut incoming = Pooled::<Self>::take();
+        incoming.v_values.resize(MAX_CHANNELS, [Lanes::ZERO; MAX_BLOCKS]);
+        incoming
+    }
+
+    /// Zeroes the planes from `first` on that hold anything; `used` of all are about to be written.
+    #[inline(always)]
+    fn clear(&mut self, first: usize, used: usize) {
+        if first < self.used {
+            self.v_values[first..self.used].fill([Lanes::ZERO; MAX_BLOCKS]);
+        }
+        self.used = used;
     }
 
     /// Reads the channels from `first` on; whether any gradient is not zero.
@@ -268,11 +295,14 @@ impl<T: Real> Incoming<T> {
                 (1, true) => return self.load_whole::<1, true>(scene, tile, v, &background),
                 (3, true) => return self.load_whole::<3, true>(scene, tile, v, &background),
                 (4, true) => return self.load_whole::<4, true>(scene, tile, v, &background),
+                (5, false) => return self.load_whole::<5, false>(scene, tile, v, &background),
+                (6, false) => return self.load_whole::<6, false>(scene, tile, v, &background),
                 _ => {}
             }
         }
         let used = (total - first).min(MAX_CHANNELS);
-        *self = Self::new();
+        self.clear(0, used);
+        self.v_transmittance[..scene.blocks()].fill(Lanes::ZERO);
         let mut any = false;
         let least = T::of(LEAST_ALPHA);
         scene.for_block_rows(tile, |block, lane, pixel, count| {
@@ -315,6 +345,7 @@ impl<T: Real> Incoming<T> {
         v: Cotangents<'_, T>,
         background: &[T; MAX_CHANNELS],
     ) -> bool {
+        self.clear(K, K);
         // Of absolute values: as long as all are zero, so is it. Comparisons would be made one by one.
         let mut sums = [T::ZERO; BLOCK];
         let colors = v.colors.as_chunks::<K>().0;

@@ -50,7 +50,7 @@ impl<T: Vectors, const K: usize, const ABSOLUTE: bool, const DEGREE: usize> Work
 /// [`median_tile`].
 struct Median<'a, T> {
     task: &'a TileTask<'a, T>,
-    masks: &'a [u16],
+    masks: &'a [u64],
     end: &'a [Lanes<T>],
     out: &'a mut TilePlane<T>,
 }
@@ -185,7 +185,7 @@ fn backward_rough<T: Vectors, const DEGREE: usize>(
 pub(crate) fn median<T: Vectors>(
     level: SimdLevel,
     task: &TileTask<'_, T>,
-    masks: &[u16],
+    masks: &[u64],
     end: &[Lanes<T>],
     out: &mut TilePlane<T>,
 ) {

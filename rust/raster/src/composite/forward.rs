@@ -23,7 +23,7 @@ pub(crate) struct Canvas<T> {
     /// See [`TileImage`].
     pub(crate) end: Vec<Lanes<T>>,
     /// Which blocks of its tile each intersection reaches; in the order of `TileLists::entries`.
-    pub(crate) masks: Vec<u16>,
+    pub(crate) masks: Vec<u64>,
     /// Accumulated depth where the image has expected depth, else empty.
     pub(crate) depths: Vec<Lanes<T>>,
     /// Pixels that stopped before the end of their tile's list.
@@ -49,6 +49,22 @@ impl<T: Real> Buffers for Canvas<T> {
     }
 }
 
+/// A tile's colours, a plane of blocks for each channel.
+#[derive(Debug)]
+struct Planes<T>(Vec<Lanes<T>>);
+
+impl<T> Default for Planes<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
+
+impl<T: Real> Buffers for Planes<T> {
+    fn bytes(&self) -> usize {
+        bytes_of(&self.0)
+    }
+}
+
 /// Consecutive tiles of one row of tiles: their rows of the image, and their part of the canvas.
 struct Strip<'a, T> {
     tile: usize,
@@ -58,7 +74,7 @@ struct Strip<'a, T> {
     transmittance: &'a mut [Lanes<T>],
     end: &'a mut [Lanes<T>],
     depths: &'a mut [Lanes<T>],
-    masks: &'a mut [u16],
+    masks: &'a mut [u64],
 }
 
 /// Takes the first values off, or all there are: an array that nobody asked for is empty.
@@ -114,8 +130,8 @@ pub(crate) fn composite<T: Vectors>(
     let mut rest = Strip {
         tile: 0,
         tiles: grid.len(),
-        colors: Default::default(),
-        alphas: Default::default(),
+        colors: std::array::from_fn(|_| [].as_mut_slice()),
+        alphas: std::array::from_fn(|_| [].as_mut_slice()),
         transmittance: stale(&mut out.transmittance, blocks),
         end: stale(&mut out.end, blocks),
         depths: stale(&mut out.depths, if scene.expected_depth { blocks } else { 0 }),
@@ -139,7 +155,11 @@ pub(crate) fn composite<T: Vectors>(
     let background: Vec<T> = (0..grid.tile_size * total)
         .map(|i| scene.background(i % total))
         .collect();
-    let planes = || vec![Lanes::ZERO; (total + SPARE_CHANNELS) * scene.blocks()];
+    let planes = || {
+        let mut planes = Pooled::<Planes<T>>::take();
+        stale(&mut planes.0, (total + SPARE_CHANNELS) * scene.blocks());
+        planes
+    };
     let saturated = AtomicUsize::new(0);
     strips
         .into_par_iter()
@@ -148,7 +168,7 @@ pub(crate) fn composite<T: Vectors>(
             while strip.tiles > 0 {
                 let tile = strip.take(scene, 1);
                 saturated.fetch_add(
-                    composite_tile(scene, &background, planes, tile),
+                    composite_tile(scene, &background, &mut planes.0, tile),
                     Ordering::Relaxed,
                 );
             }
@@ -226,6 +246,8 @@ impl<T: Real> Work for WriteTile<'_, T> {
             1 if !scene.expected_depth => write_colors::<T, 1>(scene, background, planes, &mut out),
             3 if !scene.expected_depth => write_colors::<T, 3>(scene, background, planes, &mut out),
             4 if !scene.expected_depth => write_colors::<T, 4>(scene, background, planes, &mut out),
+            5 if !scene.expected_depth => write_colors::<T, 5>(scene, background, planes, &mut out),
+            6 if !scene.expected_depth => write_colors::<T, 6>(scene, background, planes, &mut out),
             _ => write_tile(scene, background, planes, &mut out),
         }
     }

@@ -1,6 +1,7 @@
 //! What all tiles of a view share.
 
-use crate::composite::kernel::{BLOCK, Channels, LANES, MAX_BLOCKS, TileTask, anchor};
+use crate::composite::kernel::{BLOCK, LANES, MAX_BLOCKS, TileTask, anchor};
+use crate::input::channels::Channels;
 use crate::input::settings::Limits;
 use crate::lists::tile_lists::TileLists;
 use crate::math::real::Real;
@@ -13,6 +14,8 @@ pub(crate) struct Scene<'a, T> {
     pub(crate) grid: TileGrid,
     pub(crate) lists: &'a TileLists,
     pub(crate) splats: &'a [Splat<T>],
+    /// Camera z by Gaussian.
+    pub(crate) depths: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     pub(crate) expected_depth: bool,
     pub(crate) background: Option<&'a [T]>,
@@ -30,6 +33,7 @@ impl<'a, T: Real> Scene<'a, T> {
             entries: &self.lists.entries
                 [self.lists.offsets[tile] as usize..self.lists.offsets[tile + 1] as usize],
             splats: self.splats,
+            depths: self.depths,
             channels: self.channels,
             first: 0,
             limits: self.limits,
@@ -63,6 +67,10 @@ impl<'a, T: Real> Scene<'a, T> {
 
     /// The pixels of each block that are to be rendered.
     pub(crate) fn open_pixels(&self, tile: usize) -> [u16; MAX_BLOCKS] {
+        let ((left, top), size) = (self.grid.origin(tile), self.grid.tile_size);
+        if self.pixel_mask.is_none() && left + size <= self.grid.width && top + size <= self.grid.height {
+            return [0xFFFF; MAX_BLOCKS];
+        }
         let mut open = [0u16; MAX_BLOCKS];
         self.for_block_rows(tile, |block, lane, pixel, count| {
             let Some(mask) = self.pixel_mask else {

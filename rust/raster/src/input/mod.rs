@@ -1,6 +1,7 @@
 //! What a render is made from, checked.
 
 pub(crate) mod camera;
+pub(crate) mod channels;
 pub(crate) mod gaussians;
 pub(crate) mod glam;
 pub(crate) mod settings;

@@ -9,7 +9,6 @@ use crate::memory::pool::{Buffers, bytes_of, filled, stale};
 use crate::memory::shared_slice::Shared;
 use crate::project::packet::PACKET_SIZE;
 use crate::project::projected::Projected;
-use crate::project::splat::Splat;
 use crate::project::tiles::Cover;
 
 /// For every tile the splats that may reach it, front to back.
@@ -63,14 +62,14 @@ impl<T: Real> Buffers for ListScratch<T> {
 }
 
 /// Puts the Gaussians that reach some tile in order of depth, ties by index.
-fn sort_by_depth<T: Real>(splats: &[Splat<T>], covers: &[Cover], scratch: &mut ListScratch<T>) {
-    let order = stale(&mut scratch.order, splats.len());
+fn sort_by_depth<T: Real>(depths: &[T], covers: &[Cover], scratch: &mut ListScratch<T>) {
+    let order = stale(&mut scratch.order, depths.len());
     let mut reached = 0;
-    for (packet, (splats, cover)) in splats.chunks(PACKET_SIZE).zip(covers).enumerate() {
+    for (packet, (depths, cover)) in depths.chunks(PACKET_SIZE).zip(covers).enumerate() {
         let first = (packet * PACKET_SIZE) as u32;
-        for (local, splat) in splats.iter().enumerate() {
+        for (local, depth) in depths.iter().enumerate() {
             // Overwritten by the next if it reaches nothing, which is hard for a branch to predict.
-            order[reached] = (splat.depth.key(), first + local as u32);
+            order[reached] = (depth.key(), first + local as u32);
             reached += usize::from(cover.reaches(local));
         }
     }
@@ -112,9 +111,9 @@ pub(crate) fn bin_splats<T: Real>(
     lists: &mut TileLists,
 ) -> Result<(), RasterError> {
     number_intersections(projected.covers_mut())?;
-    let (splats, covers) = (&projected.splats[..], projected.covers());
+    let (depths, covers) = (&projected.depths[..], projected.covers());
     rayon::join(
-        || sort_by_depth(splats, covers, scratch),
+        || sort_by_depth(depths, covers, scratch),
         || count_by_tile(covers, tiles, &mut lists.offsets),
     );
     fill_lists(covers, scratch, lists);

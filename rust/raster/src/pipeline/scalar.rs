@@ -9,11 +9,11 @@ use crate::backproject::gradients::{ViewGradients, project_view_vjp};
 use crate::color::harmonics::{HarmonicSums, HarmonicsGradients};
 use crate::composite::backward::{CompositeGradients, Cotangents, composite_vjp};
 use crate::composite::forward::{Canvas, composite};
-use crate::composite::kernel::Channels;
 use crate::composite::median::medians;
 use crate::composite::scene::Scene;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
+use crate::input::channels::Channels;
 use crate::input::gaussians::Gaussians;
 use crate::input::glam::GlamTypes;
 use crate::input::settings::Limits;
@@ -31,6 +31,7 @@ pub trait Scalar: Vectors + GlamTypes {
     fn project(
         projected: &mut Projected<Self>,
         gaussians: &Gaussians<'_, Self>,
+        channels: Channels<'_, Self>,
         camera: &Camera<Self>,
         limits: &Limits<Self>,
         grid: &TileGrid,
@@ -75,13 +76,14 @@ macro_rules! scalar {
             fn project(
                 projected: &mut Projected<Self>,
                 gaussians: &Gaussians<'_, Self>,
+                channels: Channels<'_, Self>,
                 camera: &Camera<Self>,
                 limits: &Limits<Self>,
                 grid: &TileGrid,
                 wanted: Option<&[bool]>,
                 screen: ScreenInfo<'_, Self>,
             ) {
-                projected.project(gaussians, camera, limits, grid, wanted, screen);
+                projected.project(gaussians, channels, camera, limits, grid, wanted, screen);
             }
 
             fn bin(

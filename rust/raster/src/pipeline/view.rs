@@ -3,10 +3,10 @@
 use crate::backproject::gradients::ViewGradients;
 use crate::composite::backward::Cotangents;
 use crate::composite::forward::Canvas;
-use crate::composite::kernel::Channels;
 use crate::composite::scene::Scene;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
+use crate::input::channels::Channels;
 use crate::input::gaussians::{Gaussians, check_length};
 use crate::input::settings::{Limits, RenderMode};
 use crate::lists::tile_lists::TileLists;
@@ -62,6 +62,7 @@ impl<T: Scalar> ViewState<T> {
             grid: self.grid,
             lists: &self.lists,
             splats: &self.projected.splats,
+            depths: &self.projected.depths,
             // The median depends on how light passes, not on colours.
             channels: Channels {
                 colors: &[],
@@ -99,7 +100,7 @@ impl<T: Scalar> ViewState<T> {
 }
 
 /// Where the channels of an image come from.
-fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
+pub(crate) fn channels_of<'a, T>(gaussians: &Gaussians<'a, T>, mode: RenderMode) -> Channels<'a, T> {
     let colored = if mode.has_colors() { gaussians.channels } else { 0 };
     Channels {
         colors: gaussians.colors,
@@ -121,6 +122,7 @@ pub(crate) fn scene<'a, T: Scalar>(
         grid: TileGrid::new(view.camera.width, view.camera.height, limits.tile_size),
         lists,
         splats: &projected.splats,
+        depths: &projected.depths,
         channels: channels_of(&view.gaussians, mode),
         expected_depth: mode.expects_depth(),
         background: view.background,
@@ -154,6 +156,7 @@ pub(crate) fn render_view<T: Scalar>(
     T::project(
         &mut projected,
         &view.gaussians,
+        channels_of(&view.gaussians, mode),
         &view.camera,
         limits,
         &grid,

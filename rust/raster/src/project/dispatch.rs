@@ -2,6 +2,7 @@
 //!
 //! The arithmetic is the same at every level, down to the bit: these loops fuse no multiplication with an addition.
 
+use crate::input::channels::Channels;
 use crate::input::gaussians::Gaussians;
 use crate::math::real::Real;
 use crate::project::packet::{PacketScratch, PacketSplats, project_packet};
@@ -11,6 +12,7 @@ use crate::simd::level::{Simd, SimdLevel, Work};
 
 struct Project<'a, T, const ANTIALIASED: bool> {
     gaussians: &'a Gaussians<'a, T>,
+    channels: &'a Channels<'a, T>,
     first: usize,
     projection: &'a Projection<T>,
     grid: &'a TileGrid,
@@ -26,6 +28,7 @@ impl<T: Real, const ANTIALIASED: bool> Work for Project<'_, T, ANTIALIASED> {
     fn run<S: Simd>(self, _: S) {
         project_packet::<T, ANTIALIASED>(
             self.gaussians,
+            self.channels,
             self.first,
             self.projection,
             self.grid,
@@ -40,6 +43,7 @@ impl<T: Real, const ANTIALIASED: bool> Work for Project<'_, T, ANTIALIASED> {
 pub(crate) fn project<T: Real>(
     level: SimdLevel,
     gaussians: &Gaussians<'_, T>,
+    channels: &Channels<'_, T>,
     first: usize,
     projection: &Projection<T>,
     grid: &TileGrid,
@@ -50,6 +54,7 @@ pub(crate) fn project<T: Real>(
     if projection.antialiased() {
         level.run(Project::<T, true> {
             gaussians,
+            channels,
             first,
             projection,
             grid,
@@ -60,6 +65,7 @@ pub(crate) fn project<T: Real>(
     } else {
         level.run(Project::<T, false> {
             gaussians,
+            channels,
             first,
             projection,
             grid,

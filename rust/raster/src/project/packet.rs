@@ -3,6 +3,7 @@
 //! A packet is transposed into columns, one per number, so that the loops over its Gaussians vectorise. Packets are the
 //! unit of parallel work. Their size is fixed, so that sums over packets do not depend on the number of threads.
 
+use crate::input::channels::Channels;
 use crate::input::gaussians::Gaussians;
 use crate::math::real::Real;
 use crate::project::splat::{Projection, ScreenInfo, Splat, SplatGradient, extent, splat, splat_vjp};
@@ -63,7 +64,7 @@ fn whole_vectors(len: usize) -> usize {
 /// whatever it holds, it is overwritten as far as it is read.
 pub(crate) struct PacketScratch<T> {
     gaussians: Columns<T>,
-    splats: [Column<T>; 8],
+    splats: [Column<T>; 7],
     outlines: [Column<T>; 6],
     counts: [Column<u32>; 5],
 }
@@ -72,7 +73,7 @@ impl<T: Real> PacketScratch<T> {
     pub(crate) fn new() -> Self {
         Self {
             gaussians: Columns::new(),
-            splats: [[T::ZERO; PACKET_SIZE]; 8],
+            splats: [[T::ZERO; PACKET_SIZE]; 7],
             outlines: [[T::ZERO; PACKET_SIZE]; 6],
             counts: [[0; PACKET_SIZE]; 5],
         }
@@ -83,6 +84,8 @@ impl<T: Real> PacketScratch<T> {
 pub(crate) struct PacketSplats<'a, T> {
     /// By Gaussian; of no meaning for one that no pixel sees.
     pub(crate) splats: &'a mut [Splat<T>],
+    /// Camera z, likewise.
+    pub(crate) depths: &'a mut [T],
     pub(crate) screen: ScreenInfo<'a, T>,
     pub(crate) cover: &'a mut Cover,
 }
@@ -91,6 +94,7 @@ pub(crate) struct PacketSplats<'a, T> {
 #[inline(always)]
 pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     gaussians: &Gaussians<'_, T>,
+    channels: &Channels<'_, T>,
     first: usize,
     projection: &Projection<T>,
     grid: &TileGrid,
@@ -102,7 +106,7 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     let projection = *projection;
     let PacketScratch {
         gaussians: columns,
-        splats: [xs, ys, depths, w11s, w22s, slopes, tilts, log_opacities],
+        splats: [xs, ys, depths, w11s, w22s, slopes, log_opacities],
         outlines: [rxs, rys, padded, inverses, rights, half_heights],
         counts: [tops, bottoms, seen, ceil_xs, ceil_ys],
     } = scratch;
@@ -115,10 +119,10 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
     for lane in 0..whole_vectors(len) {
         let (mean, quat, scale, opacity) = columns.get(lane);
         let o = splat::<T, ANTIALIASED>(&projection, mean, quat, scale, opacity);
-        let s = &o.splat;
+        let s = &o;
         (xs[lane], ys[lane], depths[lane]) = (s.x, s.y, s.depth);
         (w11s[lane], w22s[lane]) = (s.w11, s.w22);
-        (slopes[lane], tilts[lane], log_opacities[lane]) = (s.slope, s.tilt, s.log_opacity);
+        (slopes[lane], log_opacities[lane]) = (s.slope, s.log_opacity);
         [rxs[lane], rys[lane]] = o.radii;
         ceil_xs[lane] = o.radii[0].lesser(most).ceiling();
         ceil_ys[lane] = o.radii[1].lesser(most).ceiling();
@@ -156,16 +160,14 @@ pub(crate) fn project_packet<T: Real, const ANTIALIASED: bool>(
         }
         out.cover.visible += 1;
         let (x, y, depth) = (xs[lane], ys[lane], depths[lane]);
-        out.splats[lane] = Splat {
-            x,
-            y,
-            w11: w11s[lane],
-            w22: w22s[lane],
-            slope: slopes[lane],
-            tilt: tilts[lane],
-            log_opacity: log_opacities[lane],
-            depth,
-        };
+        // Field by field: a splat made elsewhere would be copied.
+        let splat = &mut out.splats[lane];
+        (splat.x, splat.y) = (x, y);
+        (splat.w11, splat.w22, splat.slope) = (w11s[lane], w22s[lane], slopes[lane]);
+        (splat.right, splat.half_height) = (rights[lane], half_heights[lane]);
+        splat.log_opacity = log_opacities[lane];
+        channels.write_first(first + lane, depth, &mut splat.values);
+        out.depths[lane] = depth;
         means2d[lane] = [x, y];
         camera_zs[lane] = depth;
         radii[lane] = [ceil_xs[lane] as i32, ceil_ys[lane] as i32];

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use rayon::prelude::*;
 
 use crate::input::camera::Camera;
+use crate::input::channels::Channels;
 use crate::input::gaussians::Gaussians;
 use crate::input::settings::Limits;
 use crate::math::real::Real;
@@ -23,6 +24,8 @@ const LISTED_AT_ONCE: usize = 1 << 26;
 pub(crate) struct Projected<T> {
     /// By Gaussian; of no meaning for one that no pixel sees.
     pub(crate) splats: Vec<Splat<T>>,
+    /// Camera z, likewise.
+    pub(crate) depths: Vec<T>,
     /// By packet of Gaussians.
     covers: Vec<Cover>,
 }
@@ -31,6 +34,7 @@ impl<T> Default for Projected<T> {
     fn default() -> Self {
         Self {
             splats: Vec::new(),
+            depths: Vec::new(),
             covers: Vec::new(),
         }
     }
@@ -38,7 +42,7 @@ impl<T> Default for Projected<T> {
 
 impl<T: Real> Buffers for Projected<T> {
     fn bytes(&self) -> usize {
-        bytes_of(&self.splats) + self.covers.iter().map(Cover::bytes).sum::<usize>()
+        bytes_of(&self.splats) + bytes_of(&self.depths) + self.covers.iter().map(Cover::bytes).sum::<usize>()
     }
 }
 
@@ -55,6 +59,7 @@ impl<T: Real> Projected<T> {
     pub(crate) fn project(
         &mut self,
         gaussians: &Gaussians<'_, T>,
+        channels: Channels<'_, T>,
         camera: &Camera<T>,
         limits: &Limits<T>,
         grid: &TileGrid,
@@ -69,37 +74,40 @@ impl<T: Real> Projected<T> {
         let (projection, level) = (Projection::new(camera, limits), limits.level);
         let ScreenInfo {
             means2d,
-            depths,
+            depths: camera_zs,
             radii,
         } = screen;
         for limit in [LISTED_AT_ONCE, usize::MAX] {
             let intersections = AtomicUsize::new(0);
             (
                 stale(&mut self.splats, n).par_chunks_mut(PACKET_SIZE),
+                stale(&mut self.depths, n).par_chunks_mut(PACKET_SIZE),
                 self.covers[..packets].par_iter_mut(),
                 means2d.par_chunks_mut(PACKET_SIZE),
-                depths.par_chunks_mut(PACKET_SIZE),
+                camera_zs.par_chunks_mut(PACKET_SIZE),
                 radii.par_chunks_mut(PACKET_SIZE),
             )
                 .into_par_iter()
                 .enumerate()
                 .for_each_init(
                     PacketScratch::new,
-                    |scratch, (packet, (splats, cover, means2d, depths, radii))| {
+                    |scratch, (packet, (splats, depths, cover, means2d, camera_zs, radii))| {
                         cover.counting = intersections.load(Ordering::Relaxed) > limit;
                         let screen = ScreenInfo {
                             means2d,
-                            depths,
+                            depths: camera_zs,
                             radii,
                         };
                         let out = PacketSplats {
                             splats,
+                            depths,
                             screen,
                             cover: &mut *cover,
                         };
                         dispatch::project(
                             level,
                             gaussians,
+                            &channels,
                             packet * PACKET_SIZE,
                             &projection,
                             grid,

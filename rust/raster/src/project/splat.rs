@@ -3,6 +3,7 @@
 //! Everything here is free of branches that depend on the Gaussian, so that `packet` can run it on many at once.
 
 use crate::input::camera::{Camera, CameraModel};
+use crate::input::channels::FIRST;
 use crate::input::settings::Limits;
 use crate::math::covariance::{
     Mat3, Vec3, apply, apply_transposed, dot, normalize_quat, rotation_of, rotation_vjp, three, whiten,
@@ -22,8 +23,9 @@ const UNREACHABLE: f64 = 1e30;
 /// show the difference in an image. Only reached without an alpha threshold.
 const FAINTEST: f64 = 1.0 / (1u64 << 63) as f64;
 
-/// A Gaussian on the screen.
+/// A Gaussian on the screen: all that tiles read of it, one cache line in `f32`.
 #[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
 pub(crate) struct Splat<T> {
     pub(crate) x: T,
     pub(crate) y: T,
@@ -31,11 +33,13 @@ pub(crate) struct Splat<T> {
     pub(crate) w22: T,
     /// As in [`crate::math::covariance::Whitening`].
     pub(crate) slope: T,
-    pub(crate) tilt: T,
+    /// Of its outline, a little widened: dy of the rightmost point, and half the height.
+    pub(crate) right: T,
+    pub(crate) half_height: T,
     /// log₂ of the opacity after compensation, or of [`FAINTEST`].
     pub(crate) log_opacity: T,
-    /// Camera z.
-    pub(crate) depth: T,
+    /// Of its first channels.
+    pub(crate) values: [T; FIRST],
 }
 
 impl<T: Real> Splat<T> {
@@ -90,7 +94,8 @@ impl<T: Real> Projection<T> {
 /// log₂ of the alpha threshold, −∞ without one: a splat reaches as far as log₂ of its opacity exceeds it.
 pub(crate) fn log_threshold<T: Real>(limits: &Limits<T>) -> T {
     if limits.alpha_threshold > T::ZERO {
-        limits.alpha_threshold.greater(T::TINY).log2()
+        // Rounded once: it decides which pairs count.
+        T::of(limits.alpha_threshold.greater(T::TINY).as_f64().log2())
     } else {
         T::of(f64::NEG_INFINITY)
     }
@@ -166,9 +171,17 @@ fn footprint<T: Real>(
     }
 }
 
-/// A splat and its outline: the ellipse {u² + v² ≤ reach}, where alpha reaches the threshold.
+/// A splat on its way, and its outline: the ellipse {u² + v² ≤ reach}, where alpha reaches the threshold.
 pub(crate) struct Outlined<T> {
-    pub(crate) splat: Splat<T>,
+    pub(crate) x: T,
+    pub(crate) y: T,
+    pub(crate) w11: T,
+    pub(crate) w22: T,
+    pub(crate) slope: T,
+    pub(crate) tilt: T,
+    pub(crate) log_opacity: T,
+    /// Camera z.
+    pub(crate) depth: T,
     pub(crate) reach: T,
     /// Half the extent along x and y, in px.
     pub(crate) radii: [T; 2],
@@ -184,7 +197,7 @@ pub(crate) fn extent<T: Real>(reach: T) -> T {
     (T::of(2.0 * std::f64::consts::LN_2) * reach).sqrt()
 }
 
-/// The splat of one Gaussian.
+/// Where one Gaussian is on the screen.
 #[inline(always)]
 pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     projection: &Projection<T>,
@@ -218,16 +231,14 @@ pub(crate) fn splat<T: Real, const ANTIALIASED: bool>(
     // Radius 0 is a Gaussian that reaches the threshold only at its very centre.
     let clipped = (rx <= limits.radius_clip) & (ry <= limits.radius_clip) & (limits.radius_clip > T::ZERO);
     Outlined {
-        splat: Splat {
-            x,
-            y,
-            w11: w.w11,
-            w22: w.w22,
-            slope: w.slope,
-            tilt: w.tilt,
-            log_opacity,
-            depth,
-        },
+        x,
+        y,
+        w11: w.w11,
+        w22: w.w22,
+        slope: w.slope,
+        tilt: w.tilt,
+        log_opacity,
+        depth,
         reach,
         radii: [rx, ry],
         deviations: w.deviations,

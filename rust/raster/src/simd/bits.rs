@@ -14,22 +14,22 @@ pub(crate) fn prefetch<U>(values: &[U], index: usize) {
     let _ = (values, index);
 }
 
-/// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word.
+/// Transposes a matrix of bits: bit `b` of word `i` becomes bit `i` of word `b`. Quarters swap places, then the quarters
+/// of each, down to single bits.
 #[inline(always)]
-pub(crate) fn transpose_bits(masks: &[u16; 64]) -> [u64; 16] {
-    #[cfg(target_arch = "x86_64")]
-    return x86::transpose_bits(masks);
-    #[cfg(not(target_arch = "x86_64"))]
-    transpose_bits_one_by_one(masks)
-}
-
-#[cfg(any(test, not(target_arch = "x86_64")))]
-pub(super) fn transpose_bits_one_by_one(masks: &[u16; 64]) -> [u64; 16] {
-    std::array::from_fn(|b| {
-        let bits = masks
-            .iter()
-            .zip(0..)
-            .map(|(mask, i)| u64::from(mask >> b & 1) << i);
-        bits.fold(0, |word, bit| word | bit)
-    })
+pub(crate) fn transpose_bits(words: &mut [u64; 64]) {
+    let mut kept = u64::MAX;
+    let mut size = 32;
+    while size > 0 {
+        kept ^= kept << size;
+        for pairs in words.chunks_exact_mut(2 * size) {
+            let (upper, lower) = pairs.split_at_mut(size);
+            for (upper, lower) in upper.iter_mut().zip(lower) {
+                let swapped = (*upper >> size ^ *lower) & kept;
+                *upper ^= swapped << size;
+                *lower ^= swapped;
+            }
+        }
+        size /= 2;
+    }
 }

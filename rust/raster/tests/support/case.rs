@@ -41,7 +41,7 @@ const MODES: [RenderMode; 5] = [
 
 fn settings(dice: &mut Dice, wildness: Wildness) -> RasterSettings {
     let mut s = RasterSettings {
-        tile_size: [16, 16, 8, 4][dice.below(4)],
+        tile_size: [32, 16, 8, 4][dice.below(4)],
         antialiased: dice.once_in(4),
         exp_degree: [5, 5, 4, 3][dice.below(4)],
         ..Default::default()

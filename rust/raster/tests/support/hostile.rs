@@ -144,7 +144,7 @@ pub fn one_view<T: Scalar>(dice: &mut Dice) -> Result<bool, String> {
         return Ok(false);
     };
     let settings = RasterSettings {
-        tile_size: [4, 8, 16, 5, 0][dice.below(5)],
+        tile_size: [4, 8, 16, 32, 5, 0][dice.below(6)],
         max_alpha: [0.999, 1.0, 1.0 - 1e-9, 1e-300][dice.below(4)],
         alpha_threshold: [1.0 / 255.0, 0.0, 1.0 - 1e-9][dice.below(3)],
         min_transmittance: [1e-4, 0.0, 1.0 - 1e-9][dice.below(3)],
@@ -230,7 +230,7 @@ pub fn many_views(dice: &mut Dice) -> Result<bool, String> {
         });
     }
     let settings = RasterSettings {
-        tile_size: [4, 8, 16][dice.below(3)],
+        tile_size: [4, 8, 16, 32][dice.below(4)],
         ..Default::default()
     };
     let Ok(batch) = Batch::new(shape, inputs, &settings, MODES[dice.below(5)]) else {

@@ -1,9 +1,6 @@
 //! One tile, back to front, gradients.
 
-use super::{
-    ABSOLUTES, Entry, LANES, Lanes, MAX_BLOCKS, MAX_CHANNELS, MOMENTS, PixelCentres, TilePlane, TileTask,
-    WORD,
-};
+use super::{ABSOLUTES, Entry, LANES, Lanes, MAX_BLOCKS, MOMENTS, PixelCentres, TilePlane, TileTask, WORD};
 use crate::math::real::Real;
 use crate::memory::shared_slice::OwnPieces;
 use crate::simd::prefetch;
@@ -13,9 +10,9 @@ use crate::simd::vector::{MAX_SUMS, Vector};
 pub(crate) struct TileCotangents<'a, T> {
     pub(crate) transmittance: &'a [Lanes<T>],
     pub(crate) end: &'a [Lanes<T>],
-    pub(crate) masks: &'a [u16],
+    pub(crate) masks: &'a [u64],
     /// Gradients of the channels handled now.
-    pub(crate) v_values: &'a [TilePlane<T>; MAX_CHANNELS],
+    pub(crate) v_values: &'a [TilePlane<T>],
     /// Gradient of the final transmittance, from alpha and background.
     pub(crate) v_transmittance: &'a TilePlane<T>,
 }
@@ -23,8 +20,6 @@ pub(crate) struct TileCotangents<'a, T> {
 /// A block of pixels while splats are differentiated back to front.
 #[derive(Clone, Copy)]
 struct Block<T, const K: usize> {
-    x: Lanes<T>,
-    y: Lanes<T>,
     /// Transmittance behind the splat at hand.
     transmittance: Lanes<T>,
     /// What lies behind, per unit of transmittance: Σ weight · value · v, and the background's part.
@@ -47,7 +42,7 @@ fn absolute<V: Vector>(x: V) -> V {
 
 /// The rules of a render in vectors.
 struct Rules<V> {
-    threshold: V,
+    log_threshold: V,
     max_alpha: V,
     one: V,
 }
@@ -57,18 +52,21 @@ impl<V: Vector, const K: usize> Sums<V, K> {
     fn add<const ABSOLUTE: bool, const DEGREE: usize>(
         &mut self,
         entry: &Entry<V::Scalar, K>,
+        (x, y): (V, V),
         block: &mut Block<V::Scalar, K>,
         lane: usize,
         rules: &Rules<V>,
     ) {
         let level = rules.one.level();
-        let (u, v) = entry.whitened(block.x.get::<V>(level, lane), block.y.get(level, lane));
-        let raw = entry.raw_alpha::<V, DEGREE>(u, v);
+        let (u, v) = entry.whitened(x, y);
+        let log_alpha = entry.log_alpha(u, v);
+        let raw = log_alpha.exp2::<DEGREE>();
         let lit = block
             .end
             .get::<V>(level, lane)
             .at_least(V::splat(level, entry.place));
-        let hit = raw.at_least_where(rules.threshold, lit);
+        // Of the logarithm, which is there before alpha is.
+        let hit = log_alpha.at_least_where(rules.log_threshold, lit);
         let alpha = raw.min(rules.max_alpha).keep(hit);
         let before = block
             .transmittance
@@ -163,8 +161,6 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
     let blocks = task.side * task.side;
     let centres = PixelCentres::new(task);
     let mut state = [Block {
-        x: Lanes::ZERO,
-        y: Lanes::ZERO,
         transmittance: Lanes::ONE,
         behind: Lanes::ZERO,
         end: Lanes::ZERO,
@@ -172,11 +168,9 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
     }; MAX_BLOCKS];
     // Blocks with an incoming gradient, and the last splat that each uses. The walk goes back to front, so a block is
     // skipped until the walk reaches that splat.
-    let mut waiting = 0u16;
-    let mut ends = [0u32; MAX_BLOCKS];
+    let mut waiting = 0u64;
+    let mut ends = [0usize; MAX_BLOCKS];
     for (b, block) in state[..blocks].iter_mut().enumerate() {
-        block.x = centres.x[b];
-        block.y = centres.y[b];
         block.transmittance = pixels.transmittance[b];
         block.behind = pixels.v_transmittance[b];
         block.end = pixels.end[b];
@@ -191,13 +185,12 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
             }
         }
         let end = block.end.0.iter().fold(zero, |end, &lane| end.greater(lane));
-        ends[b] = if any { end.past_ordinal() } else { 0 };
-        waiting |= u16::from(ends[b] > 0) << b;
+        ends[b] = if any { end.past_ordinal() as usize } else { 0 };
+        waiting |= u64::from(ends[b] > 0) << b;
     }
-    let mut active = 0u16;
-    let mut next_end = ends.iter().copied().max().unwrap_or(0) as usize;
+    let mut active = 0u64;
     let rules = Rules {
-        threshold: V::splat(level, task.threshold()),
+        log_threshold: V::splat(level, task.log_threshold()),
         max_alpha: V::splat(level, task.limits.max_alpha),
         one: V::splat(level, V::Scalar::ONE),
     };
@@ -205,28 +198,28 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
     let mut entries = [Entry::<V::Scalar, K>::ZERO; WORD];
     for batch in (0..task.entries.len()).step_by(WORD).rev() {
         let masks = &pixels.masks[batch..task.entries.len().min(batch + WORD)];
+        // The blocks whose last splat is at each place of the batch.
+        let mut starting = [0u64; WORD];
+        let mut rest = waiting;
+        while rest != 0 {
+            let b = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            if ends[b] > batch {
+                starting[(ends[b] - 1 - batch) & (WORD - 1)] |= 1 << b;
+                waiting &= !(1 << b);
+            }
+        }
+        let all = starting.iter().fold(active, |all, blocks| all | blocks);
         for (i, mask) in masks.iter().enumerate() {
             // The next batch, while this one is worked on.
             task.prefetch((batch + i).wrapping_sub(WORD));
             prefetch(gradients.at(task.entries[batch + i][1]), size - 1);
-            if mask & (active | waiting) != 0 {
+            if mask & all != 0 {
                 entries[i] = Entry::load(task, batch + i);
             }
         }
         for (i, mask) in masks.iter().enumerate().rev() {
-            if batch + i < next_end {
-                next_end = 0;
-                for b in 0..blocks {
-                    if waiting >> b & 1 != 0 {
-                        if batch + i < ends[b] as usize {
-                            active |= 1 << b;
-                            waiting &= !(1 << b);
-                        } else {
-                            next_end = next_end.max(ends[b] as usize);
-                        }
-                    }
-                }
-            }
+            active |= starting[i];
             let mut rest = mask & active;
             let gradient = gradients.at(task.entries[batch + i][1]);
             if rest == 0 {
@@ -240,10 +233,12 @@ pub(crate) fn backward_tile<V: Vector, const K: usize, const ABSOLUTE: bool, con
                 absolutes: [V::splat(level, zero); ABSOLUTES],
             };
             while rest != 0 {
-                let block = rest.trailing_zeros() as usize;
+                let b = rest.trailing_zeros() as usize;
                 rest &= rest - 1;
+                let block = &mut state[b & (MAX_BLOCKS - 1)];
                 for lane in (0..LANES).step_by(V::LANES) {
-                    sums.add::<ABSOLUTE, DEGREE>(entry, &mut state[block & (MAX_BLOCKS - 1)], lane, &rules);
+                    let centres = centres.of(level, b, lane);
+                    sums.add::<ABSOLUTE, DEGREE>(entry, centres, block, lane, &rules);
                 }
             }
             write::<V::Scalar, K, ABSOLUTE>(task, gradient, &sums.reduced::<ABSOLUTE>());

@@ -1,6 +1,6 @@
 //! One tile, front to back.
 
-use super::reach::BlockCentres;
+use super::reach::Outlines;
 use super::{AHEAD, Entry, LANES, Lanes, MAX_BLOCKS, PixelCentres, TileTask, WORD};
 use crate::math::real::Real;
 use crate::simd::transpose_bits;
@@ -9,6 +9,9 @@ use crate::simd::vector::Vector;
 /// Splats loaded and composited at once: few enough to stay in the first-level cache, and a tile whose pixels have all
 /// stopped loads no more.
 const BATCH: usize = 2 * WORD;
+
+/// Splats of the next batch that are prefetched with every block.
+const AT_ONCE: usize = 4;
 
 /// Where forward writes a tile; pixels in block order. Earlier contents do not matter.
 pub(crate) struct TileImage<'a, T> {
@@ -19,7 +22,7 @@ pub(crate) struct TileImage<'a, T> {
     /// [`Real::ordinal`] of the place in the list at which a pixel stopped, or of the end of the list.
     pub(crate) end: &'a mut [Lanes<T>],
     /// Blocks that each listed splat reaches, without blocks that have stopped.
-    pub(crate) masks: &'a mut [u16],
+    pub(crate) masks: &'a mut [u64],
     /// How many pixels stopped before the end of the list.
     pub(crate) saturated: &'a mut usize,
 }
@@ -38,7 +41,7 @@ struct Light<V, const K: usize> {
 
 /// The rules of a render in vectors.
 struct Rules<V> {
-    threshold: V,
+    log_threshold: V,
     max_alpha: V,
     stop: V,
 }
@@ -48,9 +51,10 @@ impl<V: Vector, const K: usize> Light<V, K> {
     fn pass<const DEGREE: usize>(&mut self, entry: &Entry<V::Scalar, K>, x: V, y: V, rules: &Rules<V>) {
         let level = x.level();
         let (u, v) = entry.whitened(x, y);
-        let raw = entry.raw_alpha::<V, DEGREE>(u, v);
-        let hit = raw.at_least(rules.threshold);
-        let alpha = raw.min(rules.max_alpha).keep(hit);
+        let log_alpha = entry.log_alpha(u, v);
+        // Of the logarithm, which is there before alpha is.
+        let hit = log_alpha.at_least(rules.log_threshold);
+        let alpha = log_alpha.exp2::<DEGREE>().min(rules.max_alpha).keep(hit);
         let next = alpha.times_from(self.unstopped, self.unstopped);
         let on = next.above(rules.stop);
         let weight = alpha.times(self.unstopped).keep(on);
@@ -59,6 +63,37 @@ impl<V: Vector, const K: usize> Light<V, K> {
         self.end = V::splat(level, entry.place).select(on, self.end);
         for k in 0..K {
             self.sums[k] = weight.times_plus(V::splat(level, entry.values[k]), self.sums[k]);
+        }
+    }
+}
+
+/// A block of pixels while splats are composited front to back; see [`Light`].
+#[derive(Clone, Copy)]
+struct Block<T, const K: usize> {
+    unstopped: Lanes<T>,
+    transmittance: Lanes<T>,
+    end: Lanes<T>,
+    sums: [Lanes<T>; K],
+}
+
+impl<T: Real, const K: usize> Block<T, K> {
+    #[inline(always)]
+    fn get<V: Vector<Scalar = T>>(&self, level: V::Level, lane: usize) -> Light<V, K> {
+        Light {
+            unstopped: self.unstopped.get(level, lane),
+            transmittance: self.transmittance.get(level, lane),
+            end: self.end.get(level, lane),
+            sums: std::array::from_fn(|k| self.sums[k].get(level, lane)),
+        }
+    }
+
+    #[inline(always)]
+    fn set<V: Vector<Scalar = T>>(&mut self, lane: usize, light: &Light<V, K>) {
+        self.unstopped.set(lane, light.unstopped);
+        self.transmittance.set(lane, light.transmittance);
+        self.end.set(lane, light.end);
+        for k in 0..K {
+            self.sums[k].set(lane, light.sums[k]);
         }
     }
 }
@@ -72,63 +107,69 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
     out: TileImage<'_, V::Scalar>,
 ) {
     let blocks = task.side * task.side;
-    let block_centres = BlockCentres::new(task);
+    let mut outlines = Outlines::new(task);
     let centres = PixelCentres::new(task);
     let rules = Rules {
-        threshold: V::splat(level, task.threshold()),
+        log_threshold: V::splat(level, task.log_threshold()),
         max_alpha: V::splat(level, task.limits.max_alpha),
         stop: V::splat(level, task.limits.min_transmittance),
     };
-    let mut unstopped = [Lanes::ZERO; MAX_BLOCKS];
-    let mut taking: u16 = 0;
-    for block in 0..blocks {
-        unstopped[block] = match open[block] {
-            0xFFFF => Lanes::ONE,
-            bits => Lanes(std::array::from_fn(|i| V::Scalar::of(f64::from(bits >> i & 1)))),
-        };
-        taking |= u16::from(open[block] != 0) << block;
-    }
-    out.transmittance[..blocks].fill(Lanes::ONE);
-    out.end[..blocks].fill(Lanes::ZERO);
-    for plane in out.colors.chunks_exact_mut(blocks).take(K) {
-        plane.fill(Lanes::ZERO);
+    let mut state = [Block::<V::Scalar, K> {
+        unstopped: Lanes::ONE,
+        transmittance: Lanes::ONE,
+        end: Lanes::ZERO,
+        sums: [Lanes::ZERO; K],
+    }; MAX_BLOCKS];
+    let mut taking: u64 = 0;
+    for (b, (block, &bits)) in state.iter_mut().zip(open).take(blocks).enumerate() {
+        if bits != 0xFFFF {
+            block.unstopped = Lanes(std::array::from_fn(|i| V::Scalar::of(f64::from(bits >> i & 1))));
+        }
+        taking |= u64::from(bits != 0) << b;
     }
 
     let mut entries = [Entry::<V::Scalar, K>::ZERO; BATCH];
     let mut batch = 0;
     while batch < task.entries.len() && taking != 0 {
         let size = BATCH.min(task.entries.len() - batch);
-        let mut masks = [[0u16; WORD]; 2];
-        for i in 0..size {
-            task.prefetch(batch + i + AHEAD);
-            let splat = &task.splats[task.entries[batch + i][0] as usize];
-            masks[i / WORD][i % WORD] = block_centres.reached::<V>(level, splat, task.centre(splat)) & taking;
-            entries[i] = Entry::load(task, batch + i);
+        let (mut words, mut any) = ([[0u64; WORD]; BATCH / WORD], 0);
+        for (w, word) in words.iter_mut().enumerate() {
+            let places = w * WORD..size.min((w + 1) * WORD);
+            if places.is_empty() {
+                break;
+            }
+            for i in places.clone() {
+                task.prefetch(batch + i + AHEAD);
+                let splat = &task.splats[task.entries[batch + i][0] as usize];
+                outlines.set(i, splat, task.centre(splat));
+                entries[i] = Entry::load(task, batch + i);
+            }
+            let masks = outlines.blocks();
+            for ((word, mask), kept) in word.iter_mut().zip(masks).zip(&mut out.masks[batch..][places]) {
+                *word = mask & taking;
+                *kept = *word;
+                any |= *word;
+            }
+            transpose_bits(word);
         }
-        out.masks[batch..batch + size].copy_from_slice(&masks.as_flattened()[..size]);
-        let words = [transpose_bits(&masks[0]), transpose_bits(&masks[1])];
 
-        let mut rest = taking;
+        let mut ahead = batch + size;
+        let mut rest = any;
         while rest != 0 {
-            let block = rest.trailing_zeros() as usize;
+            let b = rest.trailing_zeros() as usize;
             rest &= rest - 1;
+            let block = &mut state[b & (MAX_BLOCKS - 1)];
+            // The next batch, while this one is worked on.
+            for _ in 0..AT_ONCE {
+                task.prefetch(ahead);
+                ahead += 1;
+            }
             let mut spent = true;
             for lane in (0..LANES).step_by(V::LANES) {
-                let (x, y) = (
-                    centres.x[block].get::<V>(level, lane),
-                    centres.y[block].get::<V>(level, lane),
-                );
-                let mut light = Light::<V, K> {
-                    unstopped: unstopped[block].get(level, lane),
-                    transmittance: out.transmittance[block].get(level, lane),
-                    end: out.end[block].get(level, lane),
-                    sums: [V::splat(level, V::Scalar::ZERO); K],
-                };
-                for k in 0..K {
-                    light.sums[k] = out.colors[k * blocks + block].get(level, lane);
-                }
+                let (x, y) = centres.of::<V>(level, b, lane);
+                let mut light = block.get::<V>(level, lane);
                 for (w, words) in words.iter().enumerate() {
-                    let mut word = words[block];
+                    let mut word = words[b];
                     while word != 0 {
                         let i = word.trailing_zeros() as usize;
                         word &= word - 1;
@@ -139,25 +180,25 @@ pub(crate) fn forward_tile<V: Vector, const K: usize, const DEGREE: usize>(
                     }
                 }
                 spent &= V::bits(light.unstopped.above(rules.stop)) == 0;
-                unstopped[block].set(lane, light.unstopped);
-                out.transmittance[block].set(lane, light.transmittance);
-                out.end[block].set(lane, light.end);
-                for k in 0..K {
-                    out.colors[k * blocks + block].set(lane, light.sums[k]);
-                }
+                block.set(lane, &light);
             }
-            taking &= !(u16::from(spent) << block);
+            taking &= !(u64::from(spent) << b);
         }
         batch += size;
     }
     out.masks[batch.min(task.entries.len())..].fill(0);
 
-    let rendered: u32 = open[..blocks].iter().map(|bits| bits.count_ones()).sum();
-    let mut unstopped_pixels = 0;
-    for light in &unstopped[..blocks] {
+    let mut stopped = 0;
+    for (b, (block, open)) in state[..blocks].iter().zip(open).enumerate() {
+        out.transmittance[b] = block.transmittance;
+        out.end[b] = block.end;
+        for k in 0..K {
+            out.colors[k * blocks + b] = block.sums[k];
+        }
+        stopped += open.count_ones();
         for lane in (0..LANES).step_by(V::LANES) {
-            unstopped_pixels += V::bits(light.get::<V>(level, lane).above(rules.stop)).count_ones();
+            stopped -= V::bits(block.unstopped.get::<V>(level, lane).above(rules.stop)).count_ones();
         }
     }
-    *out.saturated = (rendered - unstopped_pixels) as usize;
+    *out.saturated = stopped as usize;
 }

@@ -11,18 +11,18 @@ use crate::simd::vector::{FINEST, Vector};
 pub(crate) fn median_tile<V: Vector>(
     level: V::Level,
     task: &TileTask<'_, V::Scalar>,
-    masks: &[u16],
+    masks: &[u64],
     end: &[Lanes<V::Scalar>],
     out: &mut [Lanes<V::Scalar>; MAX_BLOCKS],
 ) {
     let blocks = task.side * task.side;
     let centres = PixelCentres::new(task);
-    let threshold = V::splat(level, task.threshold());
+    let log_threshold = V::splat(level, task.log_threshold());
     let max_alpha = V::splat(level, task.limits.max_alpha);
     let half = V::splat(level, V::Scalar::of(0.5));
     let mut transmittance = [Lanes::ONE; MAX_BLOCKS];
     *out = [Lanes::ZERO; MAX_BLOCKS];
-    let mut above_half = u16::MAX >> (MAX_BLOCKS - blocks);
+    let mut above_half = u64::MAX >> (MAX_BLOCKS - blocks);
     for (index, mask) in masks.iter().enumerate() {
         let mut rest = mask & above_half;
         if rest == 0 {
@@ -35,23 +35,22 @@ pub(crate) fn median_tile<V: Vector>(
             rest &= rest - 1;
             let mut below = true;
             for lane in (0..LANES).step_by(V::LANES) {
-                let (u, v) = entry.whitened(
-                    centres.x[block].get::<V>(level, lane),
-                    centres.y[block].get(level, lane),
-                );
-                let raw = entry.raw_alpha::<V, FINEST>(u, v);
+                let (x, y) = centres.of::<V>(level, block, lane);
+                let (u, v) = entry.whitened(x, y);
+                let log_alpha = entry.log_alpha(u, v);
                 let hit = V::both(
                     end[block].get::<V>(level, lane).at_least(place),
-                    raw.at_least(threshold),
+                    log_alpha.at_least(log_threshold),
                 );
                 let before = transmittance[block].get::<V>(level, lane);
                 let counts = V::both(hit, before.above(half));
                 out[block].set(lane, place.select(counts, out[block].get(level, lane)));
-                let after = raw.min(max_alpha).keep(hit).times_from(before, before);
+                let alpha = log_alpha.exp2::<FINEST>().min(max_alpha);
+                let after = alpha.keep(hit).times_from(before, before);
                 transmittance[block].set(lane, after);
                 below &= V::bits(after.above(half)) == 0;
             }
-            above_half &= !(u16::from(below) << block);
+            above_half &= !(u64::from(below) << block);
         }
         if above_half == 0 {
             break;

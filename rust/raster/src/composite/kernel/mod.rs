@@ -18,9 +18,10 @@ pub(crate) use backward::{TileCotangents, backward_tile};
 pub(crate) use forward::{TileImage, forward_tile};
 pub(crate) use median::median_tile;
 
+use crate::input::channels::Channels;
 use crate::input::settings::Limits;
 use crate::math::real::Real;
-use crate::project::splat::Splat;
+use crate::project::splat::{Splat, log_threshold};
 use crate::simd::prefetch;
 use crate::simd::vector::Vector;
 
@@ -29,9 +30,9 @@ pub(crate) const LANES: usize = 16;
 /// Pixels along a side of a block.
 pub(crate) const BLOCK: usize = 4;
 /// Most pixels along a side of a tile.
-pub(crate) const MAX_SIDE: usize = 16;
+pub(crate) const MAX_SIDE: usize = 32;
 /// Most blocks in a tile.
-pub(crate) const MAX_BLOCKS: usize = 16;
+pub(crate) const MAX_BLOCKS: usize = 64;
 /// Gradient values of an intersection before those of the channels: h, hu, hv, huu, huv, hvv, where h is the gradient of
 /// alpha times alpha.
 pub(crate) const MOMENTS: usize = 6;
@@ -42,7 +43,7 @@ pub(crate) const MAX_CHANNELS: usize = 8;
 /// Splats whose block masks make a word per block.
 const WORD: usize = 64;
 /// How many splats ahead of the one being loaded are prefetched.
-const AHEAD: usize = 12;
+const AHEAD: usize = 40;
 
 /// One value per pixel of a block, aligned to a cache line: a load that straddles two is slow.
 #[derive(Clone, Copy, Debug)]
@@ -85,19 +86,7 @@ impl<T: Real> Lanes<T> {
 /// One value per pixel of a tile.
 pub(crate) type TilePlane<T> = [Lanes<T>; MAX_BLOCKS];
 
-/// Where the values of channels come from: the caller's colours, then camera z.
-#[derive(Clone, Copy)]
-pub(crate) struct Channels<'a, T> {
-    pub(crate) colors: &'a [T],
-    /// Values per Gaussian in `colors`.
-    pub(crate) stride: usize,
-    /// Channels composited: `stride`, 1 more for depth after colours, or 1 for depth alone.
-    pub(crate) total: usize,
-    /// Channels of `colors` that are composited: all or none.
-    pub(crate) colored: usize,
-}
-
-/// Where coordinates of the kernels have their zero: the middle of the 16×16 pixels around the tile with this first pixel.
+/// Where coordinates of the kernels have their zero: the middle of the 32×32 pixels around the tile with this first pixel.
 /// Small coordinates round least, and an anchor that is the same for tiles of any size gives the same bits for each.
 pub(crate) fn anchor<T: Real>((left, top): (usize, usize)) -> [T; 2] {
     [left, top].map(|first| T::of((first - first % MAX_SIDE + MAX_SIDE / 2) as f64))
@@ -116,6 +105,8 @@ pub(crate) struct TileTask<'a, T> {
     pub(crate) entries: &'a [[u32; 2]],
     /// By Gaussian.
     pub(crate) splats: &'a [Splat<T>],
+    /// Camera z by Gaussian.
+    pub(crate) depths: &'a [T],
     pub(crate) channels: Channels<'a, T>,
     /// First of the channels handled now.
     pub(crate) first: usize,
@@ -130,15 +121,11 @@ impl<T: Real> TileTask<'_, T> {
         [first(self.origin.0), first(self.origin.1)]
     }
 
-    /// Prefetches the splat and the colours of a place in the list. Neighbours in the list are no neighbours in memory.
+    /// Prefetches the splat of a place in the list. Neighbours in the list are no neighbours in memory.
     #[inline(always)]
     fn prefetch(&self, index: usize) {
         if let Some(&[gaussian, _]) = self.entries.get(index) {
             prefetch(self.splats, gaussian as usize);
-            prefetch(
-                self.channels.colors,
-                gaussian as usize * self.channels.stride + self.first,
-            );
         }
     }
 
@@ -148,11 +135,11 @@ impl<T: Real> TileTask<'_, T> {
         [splat.x - self.anchor[0], splat.y - self.anchor[1]]
     }
 
-    /// The least alpha of a pair that counts; infinite if alpha is limited to less than the threshold.
+    /// log₂ of the least alpha of a pair that counts; infinite if alpha is limited to less than the threshold.
     #[inline(always)]
-    fn threshold(&self) -> T {
+    fn log_threshold(&self) -> T {
         if self.limits.max_alpha >= self.limits.alpha_threshold {
-            self.limits.alpha_threshold
+            log_threshold(self.limits)
         } else {
             T::of(f64::INFINITY)
         }
@@ -193,17 +180,16 @@ impl<T: Real, const K: usize> Entry<T, K> {
         let splat = &task.splats[gaussian];
         let [x, y] = task.centre(splat);
         let mut values = [T::ZERO; K];
-        let c = &task.channels;
-        let start = gaussian * c.stride + task.first;
-        if task.first + K <= c.colored {
-            values.copy_from_slice(&c.colors[start..start + K]);
+        if task.first == 0 {
+            values.copy_from_slice(&splat.values[..K]);
         } else {
-            for (k, value) in values.iter_mut().enumerate() {
-                if task.first + k < c.colored {
-                    *value = c.colors[start + k];
-                } else if task.first + k < c.total {
-                    *value = splat.depth;
-                }
+            let c = &task.channels;
+            for (channel, value) in (task.first..c.total).zip(&mut values) {
+                *value = if channel < c.colored {
+                    c.colors[gaussian * c.stride + channel]
+                } else {
+                    task.depths[gaussian]
+                };
             }
         }
         let w12 = splat.w12();
@@ -229,28 +215,47 @@ impl<T: Real, const K: usize> Entry<T, K> {
         )
     }
 
-    /// Alpha before it is limited: opacity · 2^−(u² + v²).
+    /// log₂ of alpha before it is limited: opacity · 2^−(u² + v²).
     #[inline(always)]
-    fn raw_alpha<V: Vector<Scalar = T>, const DEGREE: usize>(&self, u: V, v: V) -> V {
+    fn log_alpha<V: Vector<Scalar = T>>(&self, u: V, v: V) -> V {
         let v2 = v.times_minus(v, V::splat(v.level(), self.log_opacity));
-        u.minus_times_minus(u, v2).exp2::<DEGREE>()
+        u.minus_times_minus(u, v2)
     }
 }
 
 /// Pixel centres of every block from the tile's anchor.
 struct PixelCentres<T> {
-    x: TilePlane<T>,
-    y: TilePlane<T>,
+    /// Of the first block.
+    x: Lanes<T>,
+    y: Lanes<T>,
+    /// How far each block is from the first.
+    shifts: [[T; 2]; MAX_BLOCKS],
 }
 
 impl<T: Real> PixelCentres<T> {
     #[inline(always)]
     fn new(task: &TileTask<'_, T>) -> Self {
         let ([x, y], side) = (task.first_centre(), task.side);
-        let offset = |at: usize, lane: usize| T::of((at * BLOCK + lane) as f64);
-        Self {
-            x: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| x + offset(b % side, i % BLOCK)))),
-            y: std::array::from_fn(|b| Lanes(std::array::from_fn(|i| y + offset(b / side, i / BLOCK)))),
+        let mut shifts = [[T::ZERO; 2]; MAX_BLOCKS];
+        for (row, shifts) in shifts[..side * side].chunks_exact_mut(side).enumerate() {
+            for (column, shift) in shifts.iter_mut().enumerate() {
+                *shift = [column, row].map(|at| T::of((at * BLOCK) as f64));
+            }
         }
+        Self {
+            x: Lanes(std::array::from_fn(|i| x + T::of((i % BLOCK) as f64))),
+            y: Lanes(std::array::from_fn(|i| y + T::of((i / BLOCK) as f64))),
+            shifts,
+        }
+    }
+
+    /// Those of a block, from a lane on. Exact: they are small multiples of one half.
+    #[inline(always)]
+    fn of<V: Vector<Scalar = T>>(&self, level: V::Level, block: usize, lane: usize) -> (V, V) {
+        let [x, y] = self.shifts[block & (MAX_BLOCKS - 1)];
+        (
+            self.x.get::<V>(level, lane).plus(V::splat(level, x)),
+            self.y.get::<V>(level, lane).plus(V::splat(level, y)),
+        )
     }
 }

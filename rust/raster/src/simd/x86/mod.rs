@@ -279,29 +279,3 @@ level!(
 pub(in crate::simd) fn prefetch<U>(value: &U) {
     op!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()));
 }
-
-/// Bit `b` of `masks[i]` becomes bit `i` of the `b`-th word: 16 masks at a time, their bytes apart, a bit per step.
-#[inline(always)]
-pub(in crate::simd) fn transpose_bits(masks: &[u16; 64]) -> [u64; 16] {
-    let mut words = [0u64; 16];
-    for (quarter, masks) in masks.chunks_exact(16).enumerate() {
-        // SAFETY: SSE2 is part of x86-64; both loads are of 8 of the packet's 16 masks and may be unaligned.
-        unsafe {
-            let a = _mm_loadu_si128(masks.as_ptr().cast());
-            let b = _mm_loadu_si128(masks.as_ptr().add(8).cast());
-            let low = _mm_set1_epi16(0xFF);
-            let mut bytes = [
-                _mm_packus_epi16(_mm_and_si128(a, low), _mm_and_si128(b, low)),
-                _mm_packus_epi16(_mm_srli_epi16::<8>(a), _mm_srli_epi16::<8>(b)),
-            ];
-            for (half, bytes) in bytes.iter_mut().enumerate() {
-                for bit in (0..8).rev() {
-                    let sixteen = _mm_movemask_epi8(*bytes) as u64;
-                    words[half * 8 + bit] |= sixteen << (quarter * 16);
-                    *bytes = _mm_add_epi8(*bytes, *bytes);
-                }
-            }
-        }
-    }
-    words
-}
