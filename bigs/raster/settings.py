@@ -10,7 +10,7 @@ class RasterSettings:
     """The rules of the renderer. The defaults are gsplat's, so that images agree."""
 
     tile_size: int = 32
-    """Side of a square tile in pixels: 4, 8, 16 or 32, which measured fastest. A tile has one ordered list."""
+    """Side of a square tile in pixels: 4, 8, 16 or 32. A tile has one ordered list; 32 measured fastest."""
     eps2d: float = 0.3
     """Added to both variances on screen, in px²: a Gaussian thinner than a pixel still covers one."""
     near_plane: float = 0.01
