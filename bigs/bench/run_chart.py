@@ -9,7 +9,8 @@ from typing import Any, Literal
 from bigs.bench.chart import check_drawing
 from bigs.bench.run_tables import finished, is_timed, mean, score
 
-# Heading, key, and whether a score in percent is drawn as 100 minus it.
+# Heading, key, and whether a score in percent is drawn as 100 minus it. The first row has errors that fall by
+# large factors, on logarithmic axes; the others may be zero.
 _PANELS = (
     ("MPJPE, mm", "mpjpe_ra_h", False),
     ("wrists after one scale, mm", "wrist_h", False),
@@ -42,9 +43,14 @@ def draw_runs(report: dict[str, Any], clock: Clock = "wall") -> bytes:
     for axis, (heading, key, inverted) in zip(axes, _PANELS, strict=True):
         axis.set_title(heading, fontsize=9)
         axis.set_xscale("log")
+        scaled = [axis.xaxis]
+        if axis in axes[:3]:
+            axis.set_yscale("log")
+            scaled.append(axis.yaxis)
         axis.minorticks_off()
-        axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        for line in scaled:
+            line.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            line.set_major_formatter(ticker.FormatStrFormatter("%g"))
         axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(labelsize=7)
