@@ -253,7 +253,7 @@ DEMO = replace(
     ),
 )
 
-# More steps and finer images, in about a quarter of an hour.
+# More steps and finer images, in about ten minutes.
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
