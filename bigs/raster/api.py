@@ -9,7 +9,7 @@ import torch
 
 from bigs.checks import InputError, check_choice, check_finite
 from bigs.raster import cuda, reference, rust, sh
-from bigs.raster.arguments import Batch, batch_of, check_cameras, check_kind, shapes_of, slabs_of
+from bigs.raster.arguments import Batch, batch_of, broadcast_of, check_cameras, check_kind, shapes_of
 from bigs.raster.settings import RasterSettings
 from bigs.types import RenderOutput
 
@@ -200,15 +200,15 @@ def _render_rust(
     camera_model: CameraModel,
     extras: rust.Extras,
 ) -> RenderOutput:
-    slabs = slabs_of(shapes_of(tensors, pixel_mask), batch)
+    broadcast = broadcast_of(shapes_of(tensors, pixel_mask), batch)
     inputs = (*tensors.values(), *([] if "backgrounds" in tensors else [None]), pixel_mask)
-    if any(slabs.shapes):
+    if any(broadcast.shapes):
         inputs = tuple(
             tensor if shape is None else cast(torch.Tensor, tensor).expand(shape)
-            for tensor, shape in zip(inputs, slabs.shapes, strict=True)
+            for tensor, shape in zip(inputs, broadcast.shapes, strict=True)
         )
     call = rust.Call(
-        slabs.counts,
+        broadcast.counts,
         (*batch.shape, batch.cameras),
         batch.width,
         batch.height,

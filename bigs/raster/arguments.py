@@ -73,7 +73,7 @@ def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None
             )
 
 
-class Slabs(NamedTuple):
+class Broadcast(NamedTuple):
     """How the engine reads its inputs: one entry per input, in its order."""
 
     counts: tuple[tuple[int, int], ...]
@@ -152,7 +152,7 @@ def _fitted(shapes: Shapes, width: int, height: int, sh_degree: int | None) -> B
 
 
 @lru_cache(_REMEMBERED)
-def slabs_of(shapes: Shapes, batch: Batch) -> Slabs:
+def broadcast_of(shapes: Shapes, batch: Batch) -> Broadcast:
     """How the engine is to read inputs of these shapes, which `batch_of` has found to fit."""
     found = dict(shapes)
     counts: list[tuple[int, int]] = []
@@ -168,7 +168,7 @@ def slabs_of(shapes: Shapes, batch: Batch) -> Slabs:
                 count, shape = math.prod(batch.shape), (*batch.shape, *rest)
         counts.append((count, batch.cameras if per_camera and name in found else 1))
         wider.append(shape)
-    return Slabs(tuple(counts), tuple(wider))
+    return Broadcast(tuple(counts), tuple(wider))
 
 
 def _broadcast(leading: dict[str, tuple[int, ...]]) -> tuple[int, ...]:

@@ -6,8 +6,8 @@ mod fuzz;
 mod support;
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, CameraModel, GaussianGrads, GaussianSlabs, RasterSettings, RenderMode,
-    Renderer, Scalar, Slabs, Wanted,
+    Batch, BatchGaussians, BatchInputs, BatchShape, Broadcast, CameraModel, GaussianGrads, RasterSettings,
+    RenderMode, Renderer, Scalar, Wanted,
 };
 use proptest::prelude::*;
 use support::{Random, Scene, VIEWMAT, camera, intrinsics, naive, relative};
@@ -176,23 +176,23 @@ fn batch_bits<T: Scalar>(threads: usize, mode: RenderMode, channels: usize, mask
     let pixels = shape.views() * shape.width * shape.height;
     let (v_colors, v_alphas) = (noise(pixels * shape.image_channels(mode)), noise(pixels));
     let mask: Vec<bool> = (0..pixels).map(|p| p % 7 != 3 && p % 1000 > 200).collect();
-    let own = |data| Slabs {
+    let own = |data| Broadcast {
         data,
         entries: 2,
         cameras: 1,
     };
-    let shared = |data| Slabs {
+    let shared = |data| Broadcast {
         data,
         entries: 1,
         cameras: 1,
     };
-    let views = |data| Slabs {
+    let views = |data| Broadcast {
         data,
         entries: 2,
         cameras: 2,
     };
     let inputs = BatchInputs {
-        gaussians: GaussianSlabs {
+        gaussians: BatchGaussians {
             means: own(&means),
             quats: own(&quats),
             scales: shared(scenes[0].scales.as_flattened()),
@@ -202,7 +202,7 @@ fn batch_bits<T: Scalar>(threads: usize, mode: RenderMode, channels: usize, mask
         viewmats: views(&viewmats),
         ks: shared(&ks),
         backgrounds: Some(views(&backgrounds)),
-        pixel_mask: masked.then_some(Slabs {
+        pixel_mask: masked.then_some(Broadcast {
             data: &mask,
             entries: 2,
             cameras: 2,

@@ -1,6 +1,6 @@
 //! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied.
 
-use bigs_raster::{BatchInputs, BatchShape, CameraModel, GaussianSlabs, Scalar, Slabs};
+use bigs_raster::{BatchGaussians, BatchInputs, BatchShape, Broadcast, CameraModel, Scalar};
 use numpy::{
     Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray,
     PyUntypedArrayMethods, dtype,
@@ -37,7 +37,7 @@ pub(crate) fn is_single(arrays: &Bound<'_, PyTuple>) -> bool {
         .is_ok_and(|array| array.cast::<PyArrayDyn<f32>>().is_ok())
 }
 
-/// How many slabs an array holds: entries, cameras.
+/// How many parts an array holds: entries, cameras.
 pub(crate) type Count = (usize, usize);
 
 /// The values of an array in the order of its axes.
@@ -105,14 +105,14 @@ impl<'py, T: Scalar + Element> Gaussians<'py, T> {
         Ok(Self { counts, arrays: own })
     }
 
-    pub(crate) fn slabs(&self) -> PyResult<GaussianSlabs<'_, T>> {
-        let slabs = |index: usize| slabs(GAUSSIANS[index].0, &self.arrays[index], self.counts[index]);
-        Ok(GaussianSlabs {
-            means: slabs(0)?,
-            quats: slabs(1)?,
-            scales: slabs(2)?,
-            opacities: slabs(3)?,
-            colors: slabs(4)?,
+    pub(crate) fn broadcast(&self) -> PyResult<BatchGaussians<'_, T>> {
+        let of = |index: usize| broadcast(GAUSSIANS[index].0, &self.arrays[index], self.counts[index]);
+        Ok(BatchGaussians {
+            means: of(0)?,
+            quats: of(1)?,
+            scales: of(2)?,
+            opacities: of(3)?,
+            colors: of(4)?,
         })
     }
 
@@ -155,7 +155,7 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
         })
     }
 
-    /// The same as borrowed slabs, and the sizes they imply.
+    /// The same, borrowed, and the sizes they imply.
     pub(crate) fn inputs(
         &self,
         (width, height): (usize, usize),
@@ -164,15 +164,15 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
         let backgrounds = self.backgrounds.as_ref();
         let pixel_mask = self.pixel_mask.as_ref();
         let inputs = BatchInputs {
-            gaussians: self.gaussians.slabs()?,
-            viewmats: slabs("viewmats", &self.viewmats, self.counts[5])?,
-            ks: slabs("Ks", &self.ks, self.counts[6])?,
+            gaussians: self.gaussians.broadcast()?,
+            viewmats: broadcast("viewmats", &self.viewmats, self.counts[5])?,
+            ks: broadcast("Ks", &self.ks, self.counts[6])?,
             camera_model,
             backgrounds: backgrounds
-                .map(|a| slabs("backgrounds", a, self.counts[7]))
+                .map(|a| broadcast("backgrounds", a, self.counts[7]))
                 .transpose()?,
             pixel_mask: pixel_mask
-                .map(|a| slabs("pixel_mask", a, self.counts[8]))
+                .map(|a| broadcast("pixel_mask", a, self.counts[8]))
                 .transpose()?,
         };
         let shape = BatchShape {
@@ -192,12 +192,12 @@ fn wider(a: usize, b: usize) -> usize {
     if a == 1 { b } else { a }
 }
 
-fn slabs<'a, U: Element>(
+fn broadcast<'a, U: Element>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, U>,
     (entries, cameras): Count,
-) -> PyResult<Slabs<'a, U>> {
-    Ok(Slabs {
+) -> PyResult<Broadcast<'a, U>> {
+    Ok(Broadcast {
         data: contiguous(name, array)?,
         entries,
         cameras,

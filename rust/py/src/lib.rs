@@ -185,7 +185,7 @@ fn backward<'py, T: Kind>(
     [v_colors, v_alphas]: [Option<&Bound<'py, PyAny>>; 2],
     wanted: Wanted,
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let gaussians = arrays.slabs()?;
+    let gaussians = arrays.broadcast()?;
     let v_colors = v_colors.map(|v| slice::<T>("v_colors", v)).transpose()?;
     let v_alphas = v_alphas.map(|v| slice::<T>("v_alphas", v)).transpose()?;
     let v_colors = v_colors.as_ref().map(|v| contiguous("v_colors", v)).transpose()?;

@@ -61,7 +61,7 @@
 //!
 //! # Many views
 //!
-//! [`Batch`] renders entries × cameras at once. An input may be shared along either axis ([`Slabs`]): its gradient is
+//! [`Batch`] renders entries × cameras at once. An input may be shared along either axis ([`Broadcast`]): its gradient is
 //! then the sum over the views that share it. [`Wanted`] leaves out gradients that nobody needs,
 //! [`BatchInputs::pixel_mask`] pixels that nobody looks at.
 //!
@@ -123,7 +123,7 @@ mod simd;
 pub use glam;
 
 pub use api::batch::{Batch, BatchImages, BatchState, Counters};
-pub use api::batch_inputs::{BatchInputs, BatchShape, GaussianSlabs, Slabs};
+pub use api::batch_inputs::{BatchGaussians, BatchInputs, BatchShape, Broadcast};
 pub use api::batch_vjp::{BatchGradients, Wanted};
 pub use api::harmonics::Harmonics;
 pub use api::renderer::{Frame, GaussianGrads, Renderer};

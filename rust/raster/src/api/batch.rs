@@ -103,18 +103,18 @@ impl<'a, T: Scalar> Batch<'a, T> {
         let arrays = [("viewmats", inputs.viewmats, 16), ("Ks", inputs.ks, 9)];
         let backgrounds = inputs
             .backgrounds
-            .map(|slabs| ("backgrounds", slabs, shape.channels));
-        for (name, slabs, elements) in arrays.into_iter().chain(backgrounds) {
-            slabs.check(name, &shape, elements)?;
-            check_finite(name, slabs.data)?;
+            .map(|input| ("backgrounds", input, shape.channels));
+        for (name, input, elements) in arrays.into_iter().chain(backgrounds) {
+            input.check(name, &shape, elements)?;
+            check_finite(name, input.data)?;
         }
         if let Some(mask) = inputs.pixel_mask {
             mask.check("pixel_mask", &shape, shape.pixels())?;
         }
         let cameras = (0..shape.views())
             .map(|view| {
-                let viewmat = inputs.viewmats.slab(view, shape.cameras);
-                let k = inputs.ks.slab(view, shape.cameras);
+                let viewmat = inputs.viewmats.part(view, shape.cameras);
+                let k = inputs.ks.part(view, shape.cameras);
                 if [k[1], k[3], k[6], k[7], k[8] - T::ONE] != [T::ZERO; 5] {
                     return Err(RasterError::BadCamera {
                         reason: "expected a camera matrix without skew and with 0 0 1 as its last row",
@@ -150,8 +150,8 @@ impl<'a, T: Scalar> Batch<'a, T> {
         View {
             gaussians: self.inputs.gaussians.of_view(view, &self.shape),
             camera: self.cameras[view],
-            background: self.inputs.backgrounds.map(|slabs| slabs.slab(view, cameras)),
-            pixel_mask: self.inputs.pixel_mask.map(|slabs| slabs.slab(view, cameras)),
+            background: self.inputs.backgrounds.map(|input| input.part(view, cameras)),
+            pixel_mask: self.inputs.pixel_mask.map(|input| input.part(view, cameras)),
         }
     }
 
@@ -195,7 +195,7 @@ impl<'a, T: Scalar> Batch<'a, T> {
             shape: self.shape,
             mode: self.mode,
             viewmats: self.inputs.viewmats.layout(),
-            backgrounds: self.inputs.backgrounds.map(|slabs| slabs.layout()),
+            backgrounds: self.inputs.backgrounds.map(|input| input.layout()),
             views: states,
         };
         Ok((images, state))

@@ -10,7 +10,7 @@ use crate::memory::results::product;
 /// Images of a batch at most: shared inputs let a batch of any size fit into little memory.
 const MAX_VIEWS: usize = 1 << 20;
 
-/// How many slabs an input has along each axis.
+/// How many parts an input has along each axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Layout {
     entries: usize,
@@ -22,17 +22,17 @@ impl Layout {
         self.entries * self.cameras
     }
 
-    /// Which slab a view uses.
+    /// Which part a view uses.
     pub(crate) fn index(self, view: usize, cameras: usize) -> usize {
         let (entry, camera) = (view / cameras, view % cameras);
         (if self.entries > 1 { entry } else { 0 }) * self.cameras + if self.cameras > 1 { camera } else { 0 }
     }
 }
 
-/// An input of a batch: `entries` × `cameras` slabs, where 1 along either axis means "shared".
+/// An input of a batch: `entries` × `cameras` parts, one after the other; 1 along either axis is one part that all share.
 #[derive(Clone, Copy, Debug)]
-pub struct Slabs<'a, U> {
-    /// The slabs, one after the other.
+pub struct Broadcast<'a, U> {
+    /// The values of all parts.
     pub data: &'a [U],
     /// 1, or the number of batch entries.
     pub entries: usize,
@@ -40,7 +40,7 @@ pub struct Slabs<'a, U> {
     pub cameras: usize,
 }
 
-impl<'a, U> Slabs<'a, U> {
+impl<'a, U> Broadcast<'a, U> {
     pub(crate) fn count(&self) -> usize {
         self.layout().count()
     }
@@ -52,7 +52,7 @@ impl<'a, U> Slabs<'a, U> {
         }
     }
 
-    pub(crate) fn slab(&self, view: usize, cameras: usize) -> &'a [U] {
+    pub(crate) fn part(&self, view: usize, cameras: usize) -> &'a [U] {
         let size = self.data.len() / self.count();
         &self.data[self.layout().index(view, cameras) * size..][..size]
     }
@@ -140,24 +140,24 @@ impl BatchShape {
     }
 }
 
-/// The Gaussians of a batch, one row each in every slab.
+/// The Gaussians of a batch, one row each in every part.
 #[derive(Clone, Copy, Debug)]
-pub struct GaussianSlabs<'a, T> {
+pub struct BatchGaussians<'a, T> {
     /// Centres, 3 per Gaussian.
-    pub means: Slabs<'a, T>,
+    pub means: Broadcast<'a, T>,
     /// Rotations w x y z, 4 per Gaussian.
-    pub quats: Slabs<'a, T>,
+    pub quats: Broadcast<'a, T>,
     /// Standard deviations, 3 per Gaussian.
-    pub scales: Slabs<'a, T>,
+    pub scales: Broadcast<'a, T>,
     /// Opacities.
-    pub opacities: Slabs<'a, T>,
+    pub opacities: Broadcast<'a, T>,
     /// Colours, `channels` per Gaussian.
-    pub colors: Slabs<'a, T>,
+    pub colors: Broadcast<'a, T>,
 }
 
-impl<'a, T: Real> GaussianSlabs<'a, T> {
-    /// Each array with its name and its values per slab.
-    pub(crate) fn arrays(&self, shape: &BatchShape) -> [(&'static str, Slabs<'a, T>, usize); 5] {
+impl<'a, T: Real> BatchGaussians<'a, T> {
+    /// Each array with its name and its values per part.
+    pub(crate) fn arrays(&self, shape: &BatchShape) -> [(&'static str, Broadcast<'a, T>, usize); 5] {
         let n = shape.gaussians;
         [
             ("means", self.means, 3 * n),
@@ -170,16 +170,16 @@ impl<'a, T: Real> GaussianSlabs<'a, T> {
 
     /// Whether every array has the length that the shape asks for.
     pub(crate) fn check_lengths(&self, shape: &BatchShape) -> Result<(), RasterError> {
-        for (name, slabs, elements) in self.arrays(shape) {
-            slabs.check(name, shape, elements)?;
+        for (name, input, elements) in self.arrays(shape) {
+            input.check(name, shape, elements)?;
         }
         Ok(())
     }
 
     /// Whether every value is finite.
     pub(crate) fn check_values(&self, shape: &BatchShape) -> Result<(), RasterError> {
-        for (name, slabs, _) in self.arrays(shape) {
-            check_finite(name, slabs.data)?;
+        for (name, input, _) in self.arrays(shape) {
+            check_finite(name, input.data)?;
         }
         Ok(())
     }
@@ -188,11 +188,11 @@ impl<'a, T: Real> GaussianSlabs<'a, T> {
     pub(crate) fn of_view(&self, view: usize, shape: &BatchShape) -> Gaussians<'a, T> {
         let cameras = shape.cameras;
         Gaussians {
-            means: self.means.slab(view, cameras).as_chunks().0,
-            quats: self.quats.slab(view, cameras).as_chunks().0,
-            scales: self.scales.slab(view, cameras).as_chunks().0,
-            opacities: self.opacities.slab(view, cameras),
-            colors: self.colors.slab(view, cameras),
+            means: self.means.part(view, cameras).as_chunks().0,
+            quats: self.quats.part(view, cameras).as_chunks().0,
+            scales: self.scales.part(view, cameras).as_chunks().0,
+            opacities: self.opacities.part(view, cameras),
+            colors: self.colors.part(view, cameras),
             channels: shape.channels,
             harmonics: None,
         }
@@ -203,15 +203,15 @@ impl<'a, T: Real> GaussianSlabs<'a, T> {
 #[derive(Clone, Copy, Debug)]
 pub struct BatchInputs<'a, T> {
     /// What is rendered.
-    pub gaussians: GaussianSlabs<'a, T>,
+    pub gaussians: BatchGaussians<'a, T>,
     /// World-to-camera matrices.
-    pub viewmats: Slabs<'a, T>,
+    pub viewmats: Broadcast<'a, T>,
     /// Camera matrices.
-    pub ks: Slabs<'a, T>,
+    pub ks: Broadcast<'a, T>,
     /// How every camera projects.
     pub camera_model: CameraModel,
     /// One value per channel.
-    pub backgrounds: Option<Slabs<'a, T>>,
+    pub backgrounds: Option<Broadcast<'a, T>>,
     /// One value per pixel; false is not rendered.
-    pub pixel_mask: Option<Slabs<'a, bool>>,
+    pub pixel_mask: Option<Broadcast<'a, bool>>,
 }

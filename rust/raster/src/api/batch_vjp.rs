@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::api::batch::{BatchState, split};
-use crate::api::batch_inputs::{GaussianSlabs, Layout};
+use crate::api::batch_inputs::{BatchGaussians, Layout};
 use crate::backproject::gradients::ViewGradients;
 use crate::composite::backward::Cotangents;
 use crate::error::RasterError;
@@ -71,8 +71,8 @@ impl<T: Scalar> Buffers for Zeros<T> {
     }
 }
 
-fn rows_mut<const N: usize, T>(slab: &mut [T]) -> &mut [[T; N]] {
-    slab.as_chunks_mut().0
+fn rows_mut<const N: usize, T>(values: &mut [T]) -> &mut [[T; N]] {
+    values.as_chunks_mut().0
 }
 
 impl<T: Scalar> BatchState<T> {
@@ -84,7 +84,7 @@ impl<T: Scalar> BatchState<T> {
     /// [`RasterError::OutOfMemory`].
     pub fn vjp(
         &self,
-        gaussians: &GaussianSlabs<'_, T>,
+        gaussians: &BatchGaussians<'_, T>,
         v_colors: Option<&[T]>,
         v_alphas: Option<&[T]>,
         wanted: Wanted,
@@ -99,7 +99,7 @@ impl<T: Scalar> BatchState<T> {
     /// As [`BatchState::vjp`], but values are not scanned: NaN gives NaN.
     pub fn vjp_of_rendered(
         &self,
-        gaussians: &GaussianSlabs<'_, T>,
+        gaussians: &BatchGaussians<'_, T>,
         v_colors: Option<&[T]>,
         v_alphas: Option<&[T]>,
         wanted: Wanted,
@@ -119,7 +119,7 @@ impl<T: Scalar> BatchState<T> {
         check_length("v_colors", v_colors_size, v_colors.len())?;
         check_length("v_alphas", views * pixels, v_alphas.len())?;
 
-        // One slab per view, summed where views share an input.
+        // One array per view, summed where views share an input.
         let buffer = |name: &'static str, wanted: bool, size: usize| {
             filled_with(name, T::ZERO, &[if wanted { views } else { 0 }, size])
         };
@@ -190,7 +190,7 @@ impl<T: Scalar> BatchState<T> {
         })
     }
 
-    /// Sums gradients per view into gradients per slab, views in order.
+    /// Sums gradients per view into gradients per part, views in order.
     fn shared(&self, per_view: Vec<T>, layout: Layout) -> Result<Vec<T>, RasterError> {
         /// Elements summed by one task.
         const PART: usize = 4096;
@@ -200,14 +200,14 @@ impl<T: Scalar> BatchState<T> {
         }
         let size = per_view.len() / views;
         let mut sums = filled_with("gradients", T::ZERO, &[layout.count(), size])?;
-        for (index, slab) in sums.chunks_exact_mut(size).enumerate() {
+        for (index, part) in sums.chunks_exact_mut(size).enumerate() {
             let sharing: Vec<&[T]> = per_view
                 .chunks_exact(size)
                 .enumerate()
                 .filter(|&(view, _)| layout.index(view, self.shape.cameras) == index)
                 .map(|(_, values)| values)
                 .collect();
-            slab.par_chunks_mut(PART).enumerate().for_each(|(part, sums)| {
+            part.par_chunks_mut(PART).enumerate().for_each(|(part, sums)| {
                 for values in &sharing {
                     for (sum, &v) in sums.iter_mut().zip(&values[part * PART..]) {
                         *sum += v;

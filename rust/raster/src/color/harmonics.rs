@@ -29,6 +29,7 @@ pub(crate) struct HarmonicSums<'a, T> {
 
 /// Gradients of what [`crate::Harmonics`] was made of; empty if not asked for.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub struct HarmonicsGradients<T> {
     /// Of the directions, at right angles to each.
     pub dirs: Vec<[T; 3]>,

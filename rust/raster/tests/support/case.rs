@@ -1,8 +1,8 @@
 //! One call of the public API with arbitrary and adversarial inputs.
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, Camera, CameraModel, GaussianSlabs, Gaussians, Intrinsics, RasterError,
-    RasterSettings, RenderMode, Renderer, Scalar, Slabs, Wanted,
+    Batch, BatchGaussians, BatchInputs, BatchShape, Broadcast, Camera, CameraModel, Gaussians, Intrinsics,
+    RasterError, RasterSettings, RenderMode, Renderer, Scalar, Wanted,
 };
 
 use super::dice::{Dice, Wildness, number, scalar};
@@ -21,7 +21,7 @@ pub struct Case<T> {
     pub ks: Vec<T>,
     pub backgrounds: Option<Vec<T>>,
     pub pixel_mask: Option<Vec<bool>>,
-    /// Which inputs have a slab per entry: means, quats, scales, opacities, colors.
+    /// Which inputs have a part per entry: means, quats, scales, opacities, colors.
     pub per_entry: [bool; 5],
     pub v_colors: Vec<T>,
     pub v_alphas: Vec<T>,
@@ -108,11 +108,11 @@ impl<T: Scalar> Case<T> {
             settings.exp_degree = RasterSettings::default().exp_degree;
         }
         let per_entry = [(); 5].map(|()| dice.once_in(2));
-        let slabs = |own: bool| gaussians * if own { entries } else { 1 };
+        let rows = |own: bool| gaussians * if own { entries } else { 1 };
         let fill = |dice: &mut Dice, count: usize, low: f64, high: f64| -> Vec<T> {
             (0..count).map(|_| scalar(dice, wildness, low, high)).collect()
         };
-        let mut means = fill(dice, 3 * slabs(per_entry[0]), -1.0, 1.0);
+        let mut means = fill(dice, 3 * rows(per_entry[0]), -1.0, 1.0);
         // In front of the camera, most of them; some at equal depth, some on one spot.
         for mean in means.as_chunks_mut::<3>().0 {
             mean[2] = match dice.below(12) {
@@ -124,17 +124,17 @@ impl<T: Scalar> Case<T> {
                 *mean = [T::of(0.1), T::of(0.1), T::of(1.5)];
             }
         }
-        let quats = fill(dice, 4 * slabs(per_entry[1]), -1.0, 1.0);
+        let quats = fill(dice, 4 * rows(per_entry[1]), -1.0, 1.0);
         let reach = [0.02, 0.1, 0.5, 3.0][dice.below(4)];
-        let scales = fill(dice, 3 * slabs(per_entry[2]), 0.0, reach);
-        let opacities = fill(dice, slabs(per_entry[3]), 0.0, 1.0);
+        let scales = fill(dice, 3 * rows(per_entry[2]), 0.0, reach);
+        let opacities = fill(dice, rows(per_entry[3]), 0.0, 1.0);
         // What is summed over pixels and weighted by gradients needs room to grow.
         let painted = |values: Vec<T>| -> Vec<T> {
             let limit = T::of(1e15);
             let limited = |v: T| if v.is_finite() { v.limit(-limit, limit) } else { v };
             values.into_iter().map(limited).collect()
         };
-        let colors = painted(fill(dice, shape.channels * slabs(per_entry[4]), 0.0, 1.0));
+        let colors = painted(fill(dice, shape.channels * rows(per_entry[4]), 0.0, 1.0));
         let backgrounds = dice
             .once_in(2)
             .then(|| painted(fill(dice, shape.views() * shape.channels, 0.0, 1.0)));
@@ -232,8 +232,8 @@ impl<T: Scalar> Case<T> {
         }
     }
 
-    fn slabs<'a, U>(&self, data: &'a [U], per_entry: bool, per_camera: bool) -> Slabs<'a, U> {
-        Slabs {
+    fn broadcast<'a, U>(&self, data: &'a [U], per_entry: bool, per_camera: bool) -> Broadcast<'a, U> {
+        Broadcast {
             data,
             entries: if per_entry { self.shape.entries } else { 1 },
             cameras: if per_camera { self.shape.cameras } else { 1 },
@@ -241,19 +241,19 @@ impl<T: Scalar> Case<T> {
     }
 
     fn inputs(&self) -> BatchInputs<'_, T> {
-        let of_gaussians = |data, own| self.slabs(data, own, false);
+        let of_gaussians = |data, own| self.broadcast(data, own, false);
         BatchInputs {
-            gaussians: GaussianSlabs {
+            gaussians: BatchGaussians {
                 means: of_gaussians(&self.means, self.per_entry[0]),
                 quats: of_gaussians(&self.quats, self.per_entry[1]),
                 scales: of_gaussians(&self.scales, self.per_entry[2]),
                 opacities: of_gaussians(&self.opacities, self.per_entry[3]),
                 colors: of_gaussians(&self.colors, self.per_entry[4]),
             },
-            viewmats: self.slabs(&self.viewmats, true, true),
-            ks: self.slabs(&self.ks, true, true),
-            backgrounds: self.backgrounds.as_deref().map(|b| self.slabs(b, true, true)),
-            pixel_mask: self.pixel_mask.as_deref().map(|m| self.slabs(m, true, true)),
+            viewmats: self.broadcast(&self.viewmats, true, true),
+            ks: self.broadcast(&self.ks, true, true),
+            backgrounds: self.backgrounds.as_deref().map(|b| self.broadcast(b, true, true)),
+            pixel_mask: self.pixel_mask.as_deref().map(|m| self.broadcast(m, true, true)),
             camera_model: self.model,
         }
     }

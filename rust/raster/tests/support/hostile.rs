@@ -2,8 +2,8 @@
 #![allow(dead_code, unreachable_pub)]
 
 use bigs_raster::{
-    Batch, BatchInputs, BatchShape, Camera, CameraModel, GaussianSlabs, Gaussians, Harmonics, Intrinsics,
-    RasterError, RasterSettings, RenderMode, Renderer, Scalar, Slabs, Wanted,
+    Batch, BatchGaussians, BatchInputs, BatchShape, Broadcast, Camera, CameraModel, Gaussians, Harmonics,
+    Intrinsics, RasterError, RasterSettings, RenderMode, Renderer, Scalar, Wanted,
 };
 
 use super::dice::{self, Dice};
@@ -50,20 +50,20 @@ impl Shared {
     }
 
     pub fn inputs(&self) -> BatchInputs<'_, f32> {
-        let one = |data| Slabs {
+        let one = |data| Broadcast {
             data,
             entries: 1,
             cameras: 1,
         };
         BatchInputs {
-            gaussians: GaussianSlabs {
+            gaussians: BatchGaussians {
                 means: one(self.scene.means.as_flattened()),
                 quats: one(self.scene.quats.as_flattened()),
                 scales: one(self.scene.scales.as_flattened()),
                 opacities: one(&self.scene.opacities),
                 colors: one(&self.scene.colors),
             },
-            viewmats: Slabs {
+            viewmats: Broadcast {
                 data: &self.viewmats,
                 entries: 1,
                 cameras: self.shape.cameras,
@@ -187,7 +187,7 @@ pub fn one_view<T: Scalar>(dice: &mut Dice) -> Result<bool, String> {
     Ok(true)
 }
 
-/// A batch whose sizes and slabs rarely fit; whether there were images.
+/// A batch whose sizes and parts rarely fit; whether there were images.
 pub fn many_views(dice: &mut Dice) -> Result<bool, String> {
     let own = Shared::new(
         dice.below(8),
@@ -215,7 +215,7 @@ pub fn many_views(dice: &mut Dice) -> Result<bool, String> {
     }
     let masked: Vec<bool> = (0..size(dice).min(4000)).map(|_| dice.once_in(2)).collect();
     if dice.once_in(3) {
-        inputs.pixel_mask = Some(Slabs {
+        inputs.pixel_mask = Some(Broadcast {
             data: &masked,
             entries: size(dice),
             cameras: 1,
@@ -223,7 +223,7 @@ pub fn many_views(dice: &mut Dice) -> Result<bool, String> {
     }
     let background: Vec<f32> = values(dice, own.shape.channels);
     if dice.once_in(2) {
-        inputs.backgrounds = Some(Slabs {
+        inputs.backgrounds = Some(Broadcast {
             data: &background,
             entries: 1,
             cameras: 1,
