@@ -29,10 +29,12 @@ BELOW = {
     "unpickle",
     "torch_files",
     "weights",
+    "threads",
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "bigs": set(),
     "types": set(),
+    "threads": set(),
     "checks": set(),
     "checksum": set(),
     "names": {"checks"},

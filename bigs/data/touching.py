@@ -13,5 +13,7 @@ def masks_touch(labels: np.ndarray, side: Side, reach: int) -> bool:
     hand, item = labels == MASK_VALUES[side], labels == MASK_VALUES["object"]
     if not (hand.any() and item.any()):
         return False
-    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=bool)
-    return bool((scipy.ndimage.binary_dilation(hand, square) & item).any())
+    # A square is a row for each of a column's pixels.
+    row = np.ones((1, 2 * reach + 1), dtype=bool)
+    near = scipy.ndimage.binary_dilation(scipy.ndimage.binary_dilation(hand, row), row.T)
+    return bool((near & item).any())

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bigs.checks import check_shape
-from bigs.metrics.image import psnr, ssim, ssim_map
+from bigs.metrics.image import psnr, ssim_map
 from bigs.metrics.report import METRICS, Metric
 
 # A distance of two batches of images [1, 3, H, W] in [0, 1], such as LPIPS.
@@ -77,17 +77,38 @@ def picture_scores(
     if not bool(weights.any()):
         return {key: float("nan") for key in _keys(distance is not None)}
     cut, true = pred * inside, gt * inside
-    similarity = ssim_map(cut, true).mean(dim=1)
+    similarity = _similarity(cut, true)
     scores = {
         "psnr_foreground": psnr(pred, gt, weights),
         "psnr_full": psnr(pred, true),
         "ssim_foreground": similarity.mean(),
         "ssim_inside": similarity[weights].mean(),
-        "ssim_full": ssim(pred, true),
+        "ssim_full": _similarity(pred, true).mean(),
     }
     if distance is not None:
         scores |= {"lpips_foreground": distance(cut, true), "lpips_full": distance(pred, true)}
     return {key: float(value) for key, value in scores.items()}
+
+
+# Half the side of the window of SSIM, pixels.
+_WINDOW = 5
+
+
+def _similarity(pred: Tensor, true: Tensor) -> Tensor:
+    """The mean over channels of the SSIM map of two pictures [1, 3, H, W]: [1, H, W].
+
+    Where both are black as far as the window reaches it is 1, so only the rest is looked at.
+    """
+    shown = ((pred != 0) | (true != 0)).any(dim=1)[0]
+    similarity = torch.ones_like(pred[:, 0])
+    if shown.any():
+        (top, bottom), (left, right) = (
+            (max(int(lines[0]) - _WINDOW, 0), int(lines[-1]) + 1 + _WINDOW)
+            for lines in (shown.any(dim=axis).nonzero()[:, 0] for axis in (1, 0))
+        )
+        box = (..., slice(top, bottom), slice(left, right))
+        similarity[box] = ssim_map(pred[box], true[box], 2 * _WINDOW + 1).mean(dim=1)
+    return similarity
 
 
 def aligned_psnr(

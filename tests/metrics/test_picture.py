@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from skimage.metrics import structural_similarity
 
-from bigs.metrics.picture import PICTURE_METRICS, aligned_psnr, picture_scores
+from bigs.metrics.image import ssim_map
+from bigs.metrics.picture import PICTURE_METRICS, _similarity, aligned_psnr, picture_scores
 
 
 @pytest.fixture
@@ -90,3 +92,17 @@ def test_each_subject_is_compared_where_it_fits_best() -> None:
     assert aligned_psnr(renders, image, masks, reach=7) < expected - 3.0
     assert aligned_psnr(dict.fromkeys(masks, image), image, masks) == np.inf
     assert np.isnan(aligned_psnr(renders, image, dict.fromkeys(masks, np.zeros((48, 64), dtype=bool))))
+
+
+def test_what_is_black_in_both_pictures_is_alike(
+    pictures: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """The map is the same, bit by bit, whether or not black parts are left out."""
+    for offset in ((0, 0), (3, 20), (36, 30)):
+        pair = torch.zeros(2, 1, 3, 60, 60)
+        rows, columns = (slice(start, start + size) for start, size in zip(offset, (24, 30), strict=True))
+        pair[:, 0, :, rows, columns] = torch.as_tensor(np.stack(pictures[:2])).permute(0, 3, 1, 2)
+        found = _similarity(*pair)
+        assert found.equal(ssim_map(*pair).mean(dim=1))
+        assert (found == 1.0).any()
+    assert _similarity(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 8)).equal(torch.ones(1, 8, 8))

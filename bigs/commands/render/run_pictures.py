@@ -43,21 +43,34 @@ class Told:
     times: Callable[[], Mapping[str, float]]  # seconds by part, read when everything else is drawn
 
 
-def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> None:
-    """Write preview.png, preview.mp4 where PyAV is there, and report.html; what is skipped is added to the
-    report."""
+@dataclass(frozen=True)
+class Drawn:
+    """Pictures of a run, for its report."""
+
+    sheet: Image.Image
+    frames: list[tuple[str, Image.Image]]  # caption, and input, render and novel view side by side
+    video: Path | None
+    skipped: tuple[str, ...]  # what was not drawn, and why
+
+
+def draw_pictures(out: Path, clip: Clip, playback: Playback) -> Drawn:
+    """Write preview.png, and preview.mp4 where PyAV is there."""
     sheet = _sheet(clip, playback)
     save_picture(out / PREVIEW_PICTURE, sheet)
     kept: list[tuple[str, Image.Image]] = []
     strips = _ahead(_strips(clip, playback, kept))
-    video: Path | None = out / PREVIEW_VIDEO
     try:
         write_video(out / PREVIEW_VIDEO, strips, FPS)
     except InputError as missing:
-        told.report.skipped.append(f"{PREVIEW_VIDEO}: {missing}")
-        video = None
         for _ in strips:
             pass
+        return Drawn(sheet, kept, None, (f"{PREVIEW_VIDEO}: {missing}",))
+    return Drawn(sheet, kept, out / PREVIEW_VIDEO, ())
+
+
+def write_run_report(out: Path, clip: Clip, playback: Playback, drawn: Drawn, told: Told) -> None:
+    """Write report.html; what was not drawn is added to the report's skipped."""
+    told.report.skipped.extend(drawn.skipped)
     write_report(
         out / REPORT,
         title=f"{clip.name}: {len(clip)} frames",
@@ -67,9 +80,9 @@ def write_pictures(out: Path, clip: Clip, playback: Playback, told: Told) -> Non
             "Gaussians": str(playback.gaussians([0]).means.shape[1]),
             **told.report.facts,
         },
-        pictures={"input, render, render over input, turned": sheet},
-        frames=kept,
-        video=video,
+        pictures={"input, render, render over input, turned": drawn.sheet},
+        frames=drawn.frames,
+        video=drawn.video,
         metrics=told.table,
         per_frame=_errors(told.per_frame),
         grasps=grasp_timeline(playback),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from bigs.commands.folder.lock import only_writer
 from bigs.commands.folder.log import RunLog
 from bigs.commands.folder.options import check_same_options
 from bigs.commands.prior.weights import load_prior
-from bigs.commands.render.run_pictures import Told, write_pictures
+from bigs.commands.render.run_pictures import Told, draw_pictures, write_run_report
 from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.headlines import headline_meanings, headline_table
@@ -144,27 +145,32 @@ def reconstruct(
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)
             watch.begin("scores")
-            listen({"event": "note", "stage": "outputs", "text": "scoring"})
-            frames = frame_scores(clip, playback)
-            found = playback.trajectory()
-            of_frames = {} if truth is None else per_frame(found, truth)
-            scores["result"] = ({} if truth is None else evaluate(found, truth, of_frames)) | means(frames)
-            for line in report.skipped:
-                log_and_listen({"event": "skipped", "text": line})
-        write_json(out / METRICS, scores)
+            listen({"event": "note", "stage": "outputs", "text": "scoring, drawing pictures"})
+            # Neither needs the other, nor much of the interpreter.
+            with ThreadPoolExecutor(1) as beside:
+                drawing = beside.submit(draw_pictures, out, clip, playback)
+                frames = frame_scores(clip, playback)
+                found = playback.trajectory()
+                of_frames = {} if truth is None else per_frame(found, truth)
+                scores["result"] = means(frames)
+                if truth is not None:
+                    scores["result"] = evaluate(found, truth, of_frames) | scores["result"]
+                for line in report.skipped:
+                    log_and_listen({"event": "skipped", "text": line})
+                write_json(out / METRICS, scores)
+                watch.begin("pictures")
+        drawn = drawing.result()
         told = partly(frames)
         if truth is not None:
             told |= remarks(found, truth)
         table = comparison_table(scores, ALL_METRICS, told=told)
         frames |= of_frames
-        watch.begin("pictures")
-        listen({"event": "note", "stage": "outputs", "text": "drawing pictures"})
 
         def times() -> dict[str, float]:
             report.seconds = watch.read()
             return report.seconds
 
-        write_pictures(out, clip, playback, Told(table, frames, log.events, report, times))
+        write_run_report(out, clip, playback, drawn, Told(table, frames, log.events, report, times))
         return Outcome(
             out,
             headline_table(scores, told),

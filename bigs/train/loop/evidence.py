@@ -28,6 +28,8 @@ SILHOUETTE_SIGMA = 0.0022
 # Centres are moved inwards by this many standard deviations of a Gaussian in the image. Opaque neighbours
 # overlap, so their common alpha falls to one half well outside the centres.
 INSET = 2.0
+# Stages return to an earlier resolution; of the others this many bytes are kept, since memory is scarce.
+_KEPT = 160 * 2**20
 
 
 class EvidenceSource:
@@ -120,12 +122,21 @@ class EvidenceSource:
 
     def targets(self, size: int) -> Targets:
         """Images and masks, shrunk as a frame to a long side of `size` pixels; 0 keeps the clip's size."""
-        if size not in self._targets:
+        found = self._targets.pop(size, None)
+        # Before new ones take their room.
+        self._forget(_KEPT)
+        if found is None:
             long_side = max(self.clip.width, self.clip.height)
             scale = min(1.0, size / long_side) if size else 1.0
-            # Keep one resolution at a time: few stages return to an earlier one, and memory is scarce.
-            self._targets = {size: load_targets(self.clip, self.unknown, scale, self.box)}
-        return self._targets[size]
+            found = load_targets(self.clip, self.unknown, scale, self.box)
+        self._targets[size] = found
+        return found
+
+    def _forget(self, most: int) -> None:
+        """Let go of targets until what is left has at most this many bytes, the longest unused first."""
+        for size in list(self._targets):
+            if sum(targets.size() for targets in self._targets.values()) > most:
+                del self._targets[size]
 
     def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
         """A hand whose outline lies right at this resolution.

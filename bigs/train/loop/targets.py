@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bigs.data.base import Clip
+from bigs.threads import side_by_side
 from bigs.train.start.background import share_per_pixel
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
@@ -24,6 +25,10 @@ class Targets:
     K: Tensor  # [3, 3] intrinsics of the crop
     width: int
     height: int
+
+    def size(self) -> int:
+        """Bytes, with what is derived from them."""
+        return self.images.nbytes + 2 * sum(share.nbytes for share in (*self.shares.values(), self.unknown))
 
     @cached_property
     def foreground(self) -> Tensor:
@@ -68,18 +73,16 @@ def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, 
     """
     x0, y0, x1, y1 = box
     width, height = (max(1, round(scale * n)) for n in (x1 - x0, y1 - y0))
-    labels = np.stack([clip.mask(t)[y0:y1, x0:x1] for t in range(len(clip))])
-    images = np.stack([clip.image(t)[y0:y1, x0:x1] for t in range(len(clip))])
-    full = torch.from_numpy(images).permute(0, 3, 1, 2)
+    labels = np.stack(side_by_side(lambda t: clip.mask(t)[y0:y1, x0:x1], range(len(clip))))
+
     # Frame by frame: a whole clip in floats at full size would be the run's largest array.
-    small = torch.cat(
-        [
-            torch.nn.functional.interpolate(
-                frame[None].float() / 255.0, (height, width), mode="bilinear", antialias=True
-            )
-            for frame in full
-        ]
-    )
+    def shrunk(t: int) -> Tensor:
+        whole = torch.from_numpy(clip.image(t)[y0:y1, x0:x1]).permute(2, 0, 1)[None]
+        return torch.nn.functional.interpolate(
+            whole.float() / 255.0, (height, width), mode="bilinear", antialias=True
+        )
+
+    small = torch.cat(side_by_side(shrunk, range(len(clip))))
     present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
     shares = {entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present}
     # Pixel centres lie at +0.5, so image coordinates scale without an offset.

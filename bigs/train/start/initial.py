@@ -16,6 +16,7 @@ from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.smoothing import interpolated_frames, smooth_rotations, smooth_vectors
 from bigs.geometry.surface import inlier_points
 from bigs.hand import HandModel, mirror_rotation
+from bigs.threads import side_by_side
 from bigs.train.plan.start_config import InitialConfig
 from bigs.types import HandObjectTrajectory, Side
 
@@ -137,4 +138,7 @@ def initial_trajectory(clip: Clip, hand_models: Mapping[Side, HandModel]) -> Han
 def touching_frames(clip: Clip, side: Side, reach: int = 3) -> np.ndarray:
     """Frames [T] (bool) in which the masks of a hand and of the object come within `reach` pixels."""
     shown = (clip.mask_areas[side] > 0) & (clip.mask_areas["object"] > 0)
-    return np.array([bool(shown[t]) and masks_touch(clip.mask(t), side, reach) for t in range(len(clip))])
+    touch = np.zeros(len(clip), dtype=bool)
+    frames = np.flatnonzero(shown)
+    touch[frames] = side_by_side(lambda t: masks_touch(clip.mask(t), side, reach), frames)
+    return touch

@@ -21,6 +21,7 @@ from bigs.geometry.surface import (
     point_normals,
     silhouette_around_points,
 )
+from bigs.threads import side_by_side
 from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.initial import ObjectStart
 from bigs.types import MASK_VALUES
@@ -119,14 +120,16 @@ def find_object_hull(
     size = (start.points.max(0) - start.points.min(0)).max()
     lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
     grid = empty_grid(lower, upper, config.surface_resolution)
-    labels = np.stack([clip.mask(t) for t in usable])
+    labels = np.stack(side_by_side(clip.mask, usable))
     rotations, centers = start.rotations[usable].numpy(), start.centers[usable].numpy()
     # Anything but background may hide the object, so the object may be there.
     allowed = (labels != 0) | unknown[usable]
-    silhouettes = [
-        silhouette_around_points(mask, start.points @ rotation.T + center, clip.K)
-        for mask, rotation, center in zip(allowed, rotations, centers, strict=True)
-    ]
+
+    def silhouette(index: int) -> np.ndarray:
+        points_cam = start.points @ rotations[index].T + centers[index]
+        return silhouette_around_points(allowed[index], points_cam, clip.K)
+
+    silhouettes = side_by_side(silhouette, range(len(usable)))
     agreeing = min(config.surface_agreeing, len(usable))
     hull = VisualHull(np.stack(silhouettes), clip.K, rotations, centers, agreeing)
     corners = grid.points()

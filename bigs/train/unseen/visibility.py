@@ -19,6 +19,8 @@ from bigs.types import Entity
 _TOLERANCE = 0.006
 # A Gaussian with at least this weight in some frame's picture, in pixels, shows.
 SHOWS = 0.002
+# Number of frames that are rendered together: fewer calls, but little memory.
+_TOGETHER = 10
 # Number of frames on which errors are measured.
 _GUARD_FRAMES = 12
 
@@ -52,17 +54,19 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
     """
     with torch.no_grad():
         canonical = scene.canonical(scene.entities)
-    ink = torch.ones(len(canonical["object"].means), 1).requires_grad_()
-    most = torch.zeros(len(ink))
-    for frame in torch.arange(scene.n_frames)[:, None]:
-        step = Step(scene, evidence, canonical, Selection(frame, scene.entities, labels=False))
+    count = len(canonical["object"].means)
+    most = torch.zeros(count)
+    for frames in torch.arange(scene.n_frames).split(_TOGETHER):
+        step = Step(scene, evidence, canonical, Selection(frames, scene.entities, labels=False))
         with torch.no_grad():
-            posed = scene.at(frame).posed(canonical)
-        others = torch.zeros(len(posed.opacities) - len(ink), 1)
+            posed = scene.at(frames).posed(canonical)
+        # Each frame has its own, so that the gradients stay apart.
+        ink = torch.ones(len(frames), count, 1, requires_grad=True)
         # The object is the last of a scene's entities.
-        picture = step.render(posed._replace(colors=torch.cat([others, ink])))
+        others = torch.zeros(len(frames), posed.means.shape[1] - count, 1)
+        picture = step.render(posed._replace(colors=torch.cat([others, ink], dim=1)))
         (weights,) = torch.autograd.grad(picture.colors.sum(), ink)
-        most = torch.maximum(most, weights[:, 0])
+        most = torch.maximum(most, weights[..., 0].amax(0))
     return most
 
 

@@ -92,3 +92,16 @@ def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
 def test_a_silhouette_is_as_large_as_the_hand(source: EvidenceSource) -> None:
     """An outline that is off by a per cent is paid for with a per cent of depth: most of a centimetre."""
     assert abs(best_depth(source.scene, source, 0) - 1.0) < 0.011
+
+
+def test_targets_are_kept_while_there_is_room(
+    source: EvidenceSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = source.targets(40), source.targets(20)
+    assert source.targets(40) is first
+    assert source.targets(20) is second
+    # Room for the smaller ones alone: the larger go when they are not looked at.
+    monkeypatch.setattr("bigs.train.loop.evidence._KEPT", second.size())
+    source.targets(30)
+    assert source.targets(20) is second
+    assert source.targets(40) is not first
