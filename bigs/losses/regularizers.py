@@ -23,3 +23,20 @@ def lbs_deviation(weights: Tensor, target: Tensor) -> Tensor:
 def squared_norm(residuals: Tensor) -> Tensor:
     """Mean of ||r||^2 over residuals r [..., D], in their own unit squared: a normal prior around zero."""
     return residuals.square().sum(-1).mean()
+
+
+# Joints of index, middle, ring and pinky, in their order across the hand, and in that of MANO's pose.
+_FINGERS = ((0, 1, 2), (3, 4, 5), (9, 10, 11), (6, 7, 8))
+
+
+def finger_likeness(hand_pose: Tensor) -> Tensor:
+    """Mean of ||R_a - R_b||_F^2 / 2 over the same joint of neighbouring fingers a and b: squared radians.
+
+    Tendons and the shape of what a hand holds bend neighbouring fingers alike, so a finger that nothing shows
+    is expected to be as those beside it. The thumb has no such neighbour.
+
+    Args:
+        hand_pose: rotations [T, 15, 3, 3] in MANO's joint order.
+    """
+    fingers = hand_pose[:, [list(finger) for finger in _FINGERS]]
+    return 0.5 * (fingers[:, 1:] - fingers[:, :-1]).square().sum((-1, -2)).mean()

@@ -17,7 +17,13 @@ from bigs.losses.contact import center_contact, penetration, surface_contact
 from bigs.losses.mask import outside_mask, outside_mask_on
 from bigs.losses.perceptual import masked_perceptual
 from bigs.losses.photometric import masked_ssim
-from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
+from bigs.losses.regularizers import (
+    color_spread,
+    finger_likeness,
+    lbs_deviation,
+    scale_size,
+    squared_norm,
+)
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.train.loop.step import Step
 from bigs.train.loop.virtual_views import object_orbit, render_object
@@ -234,6 +240,11 @@ def pose_prior(step: Step) -> Tensor:
     )
 
 
+def fingers_alike(step: Step) -> Tensor:
+    """Squared angles, in radians, between the same joints of neighbouring fingers, a mean over hands."""
+    return _mean(finger_likeness(step.posed_clip.hand(side).hand_pose) for side in step.scene.sides)
+
+
 def depth_prior(step: Step) -> Tensor:
     """Squared relative distance from the depth that a frame outside grasps is expected to have."""
 
@@ -351,6 +362,7 @@ TERMS: dict[str, Term] = {
         object_acceleration=object_acceleration,
         orient_prior=orient_prior,
         pose_prior=pose_prior,
+        fingers_alike=fingers_alike,
         depth_prior=depth_prior,
         betas_prior=betas_prior,
         object_prior=object_prior,

@@ -22,7 +22,16 @@ from bigs.train.plan.densify_config import DensifyConfig
 from bigs.train.plan.start_config import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
-_POSE_PRIORS = {"betas_prior": 0.01, "pose_prior": 1.0, "orient_prior": 0.1, "acceleration": 0.005}
+_POSE_PRIORS = {
+    "betas_prior": 0.01,
+    "pose_prior": 1.0,
+    "fingers_alike": 0.6,
+    "orient_prior": 0.1,
+    "acceleration": 0.005,
+}
+# Grasps average over frames, so their estimates count more. Neighbouring fingers differ about as much as a
+# regressor errs, so the two priors on fingers keep one ratio.
+_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_alike": 3.0}
 
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
@@ -72,7 +81,7 @@ _GRASPED = OptimizeStage(
     step="single-subject",
     steps=50,
     lrs=_GRASPED_RATES,
-    weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0},
+    weights={"silhouette": 1.0, **_GRASP_PRIORS},
     image_size=160,
     final_lr=0.3,
 )
@@ -81,7 +90,7 @@ _CONTACT = OptimizeStage(
     step="interacting-subjects",
     steps=50,
     lrs=_GRASPED_RATES,
-    weights={"silhouette": 1.0, **_POSE_PRIORS, "pose_prior": 5.0, "contact": 0.1, "penetration": 0.01},
+    weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "penetration": 0.01},
     image_size=160,
 )
 _APPEARANCE = OptimizeStage(
@@ -122,8 +131,9 @@ _PLAUSIBLE_TOGETHER = {
     "offset": 0.02,
     "shade_prior": 0.01,
     **_POSE_PRIORS,
-    # Colours now say what this prior had to say before.
+    # Colours now say what these priors had to say before.
     "pose_prior": 0.2,
+    "fingers_alike": 0.12,
     "depth_prior": 12.0,
     "rigid": 0.03,
     "contact": 0.1,
