@@ -29,14 +29,15 @@ def squared_norm(residuals: Tensor) -> Tensor:
 _FINGERS = ((0, 1, 2), (3, 4, 5), (9, 10, 11), (6, 7, 8))
 
 
-def finger_likeness(hand_pose: Tensor) -> Tensor:
-    """Mean of ||R_a - R_b||_F^2 / 2 over the same joint of neighbouring fingers a and b: squared radians.
+def finger_unevenness(hand_pose: Tensor) -> Tensor:
+    """Mean of ||R_a - 2 R_b + R_c||_F^2 / 2 over a joint of three neighbouring fingers: squared radians.
 
-    Tendons and the shape of what a hand holds bend neighbouring fingers alike, so a finger that nothing shows
-    is expected to be as those beside it. The thumb has no such neighbour.
+    Tendons, and the shape of what a hand holds, bend fingers evenly from the index to the pinky, so a finger
+    that nothing shows is expected to be the mean of those beside it. The thumb has no such neighbours.
 
     Args:
         hand_pose: rotations [T, 15, 3, 3] in MANO's joint order.
     """
     fingers = hand_pose[:, [list(finger) for finger in _FINGERS]]
-    return 0.5 * (fingers[:, 1:] - fingers[:, :-1]).square().sum((-1, -2)).mean()
+    bend = fingers[:, 2:] - 2.0 * fingers[:, 1:-1] + fingers[:, :-2]
+    return 0.5 * bend.square().sum((-1, -2)).mean()

@@ -230,7 +230,7 @@ _INGREDIENTS = {
     ),
     "pose_priors": Switch(
         "what keeps poses, depths and shape near their estimates",
-        _terms("orient_prior", "pose_prior", "fingers_alike", "depth_prior", "betas_prior", "object_prior"),
+        _terms("orient_prior", "pose_prior", "fingers_even", "depth_prior", "betas_prior", "object_prior"),
     ),
     "hand_geometry": Switch(
         "offsets, rotations and scales of the hand's Gaussians",

@@ -19,7 +19,7 @@ from bigs.losses.perceptual import masked_perceptual
 from bigs.losses.photometric import masked_ssim
 from bigs.losses.regularizers import (
     color_spread,
-    finger_likeness,
+    finger_unevenness,
     lbs_deviation,
     scale_size,
     squared_norm,
@@ -240,9 +240,9 @@ def pose_prior(step: Step) -> Tensor:
     )
 
 
-def fingers_alike(step: Step) -> Tensor:
-    """Squared angles, in radians, between the same joints of neighbouring fingers, a mean over hands."""
-    return _mean(finger_likeness(step.posed_clip.hand(side).hand_pose) for side in step.scene.sides)
+def fingers_even(step: Step) -> Tensor:
+    """How unevenly joints bend from the index to the pinky, squared radians, a mean over hands."""
+    return _mean(finger_unevenness(step.posed_clip.hand(side).hand_pose) for side in step.scene.sides)
 
 
 def depth_prior(step: Step) -> Tensor:
@@ -362,7 +362,7 @@ TERMS: dict[str, Term] = {
         object_acceleration=object_acceleration,
         orient_prior=orient_prior,
         pose_prior=pose_prior,
-        fingers_alike=fingers_alike,
+        fingers_even=fingers_even,
         depth_prior=depth_prior,
         betas_prior=betas_prior,
         object_prior=object_prior,

@@ -25,13 +25,13 @@ from bigs.train.plan.start_config import InitialConfig
 _POSE_PRIORS = {
     "betas_prior": 0.01,
     "pose_prior": 1.0,
-    "fingers_alike": 0.6,
+    "fingers_even": 0.3,
     "orient_prior": 0.1,
     "acceleration": 0.005,
 }
-# Grasps average over frames, so their estimates count more. Neighbouring fingers differ about as much as a
-# regressor errs, so the two priors on fingers keep one ratio.
-_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_alike": 3.0}
+# Grasps average over frames, so their estimates count more. The two priors on fingers keep one ratio: that in
+# which a regressor's error and the unevenness of fingers usually are.
+_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5}
 
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
@@ -133,7 +133,7 @@ _PLAUSIBLE_TOGETHER = {
     **_POSE_PRIORS,
     # Colours now say what these priors had to say before.
     "pose_prior": 0.2,
-    "fingers_alike": 0.12,
+    "fingers_even": 0.06,
     "depth_prior": 12.0,
     "rigid": 0.03,
     "contact": 0.1,
