@@ -216,3 +216,24 @@ def test_a_refusal_in_a_process_of_its_own(tmp_path: Path) -> None:
     answer = run_bigs("reconstruct", tmp_path / "nowhere", "--out", tmp_path / "out")
     assert_refused(answer, "bigs: ", "nowhere: expected a clip folder")
     assert "\x1b" not in answer.err
+
+
+@pytest.mark.parametrize(("given", "threads"), [(None, "1"), ("3", "3")])
+def test_numpy_multiplies_on_one_thread_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, threads: str
+) -> None:
+    """The setting counts when numpy is loaded, and results must not depend on the number of cores."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+    script = """
+import os, sys
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy":
+            print(os.environ.get("OPENBLAS_NUM_THREADS"))
+sys.meta_path.insert(0, Watch())
+import bigs.cli
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [threads]

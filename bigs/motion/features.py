@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.colmap import pycolmap
+from bigs.threads import side_by_side
 
 # Margin of a crop in pixels, so that features at the object's border have their full patch.
 _MARGIN = 12
@@ -81,12 +82,11 @@ def extract_features(
     features = [NOTHING] * len(images)
     # pycolmap uses all cores only when it reads files.
     with tempfile.TemporaryDirectory(prefix="bigs-sift-") as folder, quiet_colmap():
-        crops = {}
-        for t, (image, box) in enumerate(zip(images, boxes, strict=True)):
-            if box is not None:
-                crops[f"{t:06d}.png"] = _write_crop(Path(folder) / f"{t:06d}.png", image, box, scale)
-        if not crops:
+        shown = {f"{t:06d}.png": (images[t], box) for t, box in enumerate(boxes) if box is not None}
+        if not shown:
             return features
+        written = side_by_side(lambda name: _write_crop(Path(folder) / name, *shown[name], scale), shown)
+        crops = dict(zip(shown, written, strict=True))
         file = Path(folder) / "features.db"
         pycolmap.Database.open(file).close()
         pycolmap.extract_features(

@@ -18,6 +18,7 @@ from bigs.data.base import Clip
 from bigs.geometry.arrays import float32
 from bigs.models.poses import PoseErrors
 from bigs.motion.tracker import GivenPoses, TrackedMotion, track
+from bigs.threads import side_by_side
 from bigs.train.plan.config import ObjectMotionStage
 from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.initial import ObjectStart, object_in_camera
@@ -50,8 +51,8 @@ def find_object_motion(
     kept = None if folder is None else _read(folder / FILE_NAME, digest)
     if kept is not None:
         return kept
-    images = [clip.image(t) for t in range(len(clip))]
-    masks = np.stack([clip.mask(t) == MASK_VALUES["object"] for t in range(len(clip))])
+    images = side_by_side(clip.image, range(len(clip)))
+    masks = np.stack(side_by_side(clip.mask, range(len(clip)))) == MASK_VALUES["object"]
     found = track(images, masks, np.asarray(clip.K, dtype=np.float64), given, stage.tracker)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
