@@ -111,7 +111,9 @@ fn powers_to<V: Vector, const DEGREE: usize>(level: V::Level, precision: f64) {
 }
 
 fn powers<V: Vector>(level: V::Level) {
-    powers_to::<V, 5>(level, 3.0 * epsilon::<V>());
+    // Under Miri the library's own powers, with which these are compared, are off by some last bits, chosen at random.
+    let slack = if cfg!(miri) { 16.0 * f64::EPSILON } else { 0.0 };
+    powers_to::<V, 5>(level, 3.0 * epsilon::<V>() + slack);
 }
 
 #[test]
