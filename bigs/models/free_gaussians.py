@@ -21,6 +21,7 @@ class FreeGaussians(nn.Module):
     opacity_logits: Tensor
     color_logits: Tensor
     normals: Tensor
+    freedom: Tensor
 
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; `start` fills it."""
@@ -31,6 +32,8 @@ class FreeGaussians(nn.Module):
         self.register_buffer("opacity_logits", torch.zeros(count))
         self.register_buffer("color_logits", torch.zeros(count, 3))
         self.register_buffer("normals", torch.zeros(count, 3))
+        # Factor on each Gaussian's residuals, at most 1: one that hardly shows stays as its field made it.
+        self.register_buffer("freedom", torch.ones(count))
         # Along the normal, metres: along the surface there are Gaussians already.
         self.shift = nn.Parameter(torch.zeros(count))
         self.size = nn.Parameter(torch.zeros(count, 3))  # logarithmic
@@ -51,19 +54,19 @@ class FreeGaussians(nn.Module):
     @property
     def offsets(self) -> Tensor:
         """[N, 3] metres from the start."""
-        return self.shift[:, None] * self.normals
+        return (self.freedom * self.shift)[:, None] * self.normals
 
     @property
     def scales(self) -> Tensor:
         """Standard deviations [N, 3], metres."""
-        return (self.base_log_scales + self.size).exp()
+        return (self.base_log_scales + self.freedom[:, None] * self.size).exp()
 
     @property
     def opacities(self) -> Tensor:
         """[N] in (0, 1)."""
-        return torch.sigmoid(self.opacity_logits + self.opacity)
+        return torch.sigmoid(self.opacity_logits + self.freedom * self.opacity)
 
     @property
     def colors(self) -> Tensor:
         """[N, 3] in (0, 1)."""
-        return torch.sigmoid(self.color_logits + self.color)
+        return torch.sigmoid(self.color_logits + self.freedom[:, None] * self.color)

@@ -46,11 +46,16 @@ class HandDetail(FreeGaussians):
 
 
 @torch.no_grad()
-def free_hand(hand: HandSplats | HandDetail) -> HandDetail:
-    """The Gaussians as they are now, without a field."""
+def free_hand(hand: HandSplats | HandDetail, freedom: Tensor | None = None) -> HandDetail:
+    """The Gaussians as they are now, without a field.
+
+    `freedom` [N] in [0, 1] is the factor on what each of them learns from now on; 1 if not given.
+    """
     whole = hand()
     detail = HandDetail(hand.model, whole)
     # A Gaussian is thin along its third axis, the surface's outward normal.
     normals = quat_to_matrix(whole.quats)[..., 2]
     detail.start(whole.points, whole.quats, whole.scales, whole.opacities, whole.colors, normals)
+    if freedom is not None:
+        detail.freedom.copy_(freedom)
     return detail

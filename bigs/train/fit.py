@@ -42,7 +42,8 @@ from bigs.train.resolve import asks_prior
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
 from bigs.train.start.object_motion import find_object_motion, in_words
-from bigs.train.unseen.stages import run_completion, run_guidance
+from bigs.train.unseen.stages import OBSERVED_AT, run_completion, run_guidance
+from bigs.train.unseen.visibility import hands_shown
 from bigs.types import Side
 
 
@@ -181,7 +182,7 @@ def fit(
                 text = f"{side} hand holds the object in frames {found.text()}"
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, SplitStage):
-            for text in _split(scene, stage):
+            for text in _split(scene, stage, sources):
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, CompletionStage | GuidanceStage):
             if isinstance(stage, CompletionStage):
@@ -235,12 +236,13 @@ def _object_motion(
     return motion
 
 
-def _split(scene: Scene, stage: SplitStage) -> list[str]:
+def _split(scene: Scene, stage: SplitStage, sources: EvidenceSource) -> list[str]:
     """Free the scene's Gaussians of their fields; returns what to report."""
     notes = []
     if stage.hands:
+        shown = hands_shown(scene, sources.evidence(OBSERVED_AT))
         for side, hand in scene.hand_splats.items():
-            scene.hand_splats[side] = free_hand(hand)
+            scene.hand_splats[side] = free_hand(hand, shown[side])
             notes.append(f"{len(scene.hand_splats[side].shift)} Gaussians of the hand are free")
     if scene.object_splats is not None:
         with torch.no_grad():

@@ -54,6 +54,23 @@ def test_a_shift_goes_along_the_thin_axis(field: HandSplats) -> None:
     assert not moved[:7].any() and not moved[8:].any()
 
 
+def test_what_hardly_shows_stays_as_its_field_made_it(field: HandSplats) -> None:
+    freedom = torch.ones(len(field().points))
+    freedom[:5], freedom[5] = 0.0, 0.5
+    detail = free_hand(field, freedom)
+    before = detail()
+    with torch.no_grad():
+        for parameter in (detail.shift, detail.size, detail.opacity, detail.color):
+            parameter.fill_(0.01)
+    after = detail()
+    for name in ("points", "scales", "opacities", "colors"):
+        moved = (getattr(after, name) - getattr(before, name)).abs().reshape(len(freedom), -1).amax(1)
+        assert not moved[:5].any() and (moved[5:] > 0.0).all(), name
+    torch.testing.assert_close((after.scales / before.scales)[5].log(), torch.full((3,), 0.005))
+    after.colors.sum().backward()
+    assert not detail.color.grad[:5].any() and detail.color.grad[5:].any()
+
+
 def test_freed_twice_is_freed_once(field: HandSplats) -> None:
     once = free_hand(field)
     with torch.no_grad():

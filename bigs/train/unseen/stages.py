@@ -15,7 +15,7 @@ from bigs.train.unseen.prior_stage import guide_scene
 from bigs.train.unseen.symmetry_stage import StageOutcome, complete_scene
 
 # Image size at which errors of the seen part are measured.
-_OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
+OBSERVED_AT = OptimizeStage("observed", "single-subject", 0, {}, {}, image_size=240)
 
 
 def run_completion(
@@ -30,7 +30,7 @@ def run_completion(
         scene,
         sources.clip,
         sources.unknown,
-        sources.evidence(_OBSERVED_AT),
+        sources.evidence(OBSERVED_AT),
         stage,
         config.initial,
         config.prior.completion,
@@ -58,5 +58,5 @@ def run_guidance(
         if state.step % config.checkpoint_every == 0 and state.step < stage.steps:
             keep(index, state)
 
-    evidence = sources.evidence(_OBSERVED_AT)
+    evidence = sources.evidence(OBSERVED_AT)
     return guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, resume, after_step)

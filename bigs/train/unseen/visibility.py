@@ -13,7 +13,7 @@ from bigs.losses.photometric import masked_l1
 from bigs.models.canonical import CanonicalObject
 from bigs.models.scene import Scene
 from bigs.train.loop.step import Evidence, Selection, Step
-from bigs.types import Entity
+from bigs.types import Entity, Side
 
 # Typical error of poses, metres.
 _TOLERANCE = 0.006
@@ -23,6 +23,8 @@ SHOWS = 0.002
 _TOGETHER = 10
 # Number of frames on which errors are measured.
 _GUARD_FRAMES = 12
+# Number of frames that say what the clip shows of the hands.
+_SHOWN_FRAMES = 30
 
 
 def object_views(scene: Scene, evidence: Evidence) -> ObjectViews:
@@ -41,9 +43,9 @@ def frames_seen(canonical: CanonicalObject, views: ObjectViews) -> np.ndarray:
     return times_seen(views, points, canonical.normals.numpy(), points, _TOLERANCE)
 
 
-def guard_frames(n_frames: int) -> Tensor:
-    """Some frames of a clip, evenly spread."""
-    return torch.linspace(0, n_frames - 1, min(_GUARD_FRAMES, n_frames)).round().long()
+def guard_frames(n_frames: int, most: int = _GUARD_FRAMES) -> Tensor:
+    """At most so many frames of a clip, evenly spread."""
+    return torch.linspace(0, n_frames - 1, min(most, n_frames)).round().long()
 
 
 def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
@@ -68,6 +70,35 @@ def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
         (weights,) = torch.autograd.grad(picture.colors.sum(), ink)
         most = torch.maximum(most, weights[..., 0].amax(0))
     return most
+
+
+def hands_shown(scene: Scene, evidence: Evidence) -> dict[Side, Tensor]:
+    """How well the clip shows each Gaussian of a hand, [N] in [0, 1] by the side that is trained.
+
+    That is what a Gaussian weighs in pixels that show its hand, by what it weighs in all pixels, squared: the
+    most in a frame of either. Both hands count where they share one canonical hand. It is near 0 below a
+    sleeve, which no Gaussian draws, and where object or hand always hide it.
+    """
+    with torch.no_grad():
+        canonical = scene.canonical(scene.entities)
+    own: dict[Side, Tensor] = {}
+    whole: dict[Side, Tensor] = {}
+    for frames in guard_frames(scene.n_frames, _SHOWN_FRAMES).split(_TOGETHER):
+        step = Step(scene, evidence, canonical, Selection(frames, scene.entities, labels=False))
+        with torch.no_grad():
+            posed = scene.at(frames).posed(canonical)
+        ink = torch.ones(*posed.means.shape[:2], 1, requires_grad=True)
+        picture = step.render(posed._replace(colors=ink)).colors[..., 0]
+        (anywhere,) = torch.autograd.grad(picture.sum(), ink, retain_graph=True)
+        first = 0
+        for side in scene.sides:
+            (shown,) = torch.autograd.grad((picture * step.share(side)).sum(), ink, retain_graph=True)
+            trained, rows = scene.canonical_side(side), slice(first, first + len(canonical[side].points))
+            first = rows.stop
+            for most, weights in ((own, shown), (whole, anywhere)):
+                found = weights[:, rows, 0].amax(0)
+                most[trained] = torch.maximum(most.get(trained, found), found)
+    return {side: (own[side] / (whole[side] + SHOWS)).square() for side in own}
 
 
 @torch.no_grad()
