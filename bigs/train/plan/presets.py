@@ -243,7 +243,7 @@ FAST = RunConfig(
     ),
 )
 
-# For a little clip, in well under two minutes on two cores.
+# For a little clip, in about half a minute on two cores.
 DEMO = replace(
     FAST,
     stages=(
@@ -263,7 +263,7 @@ DEMO = replace(
     ),
 )
 
-# More steps and finer images, in about ten minutes.
+# More steps and finer images, in about five minutes.
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
