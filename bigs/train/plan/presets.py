@@ -243,7 +243,7 @@ FAST = RunConfig(
     ),
 )
 
-# For a little clip, in about half a minute on two cores.
+# For a little clip, in 30 to 40 seconds on two cores.
 DEMO = replace(
     FAST,
     stages=(

@@ -15,7 +15,7 @@ from bigs.models.scene import Scene
 from bigs.train.fit import fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Evidence
-from bigs.train.plan.config import PriorConfig
+from bigs.train.plan.config import PriorConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.unseen.stages import OBSERVED_AT
 from bigs.train.unseen.visibility import hands_shown
@@ -36,6 +36,12 @@ def posed(
     scene, _ = fit(clip, both_hands, PLAN)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     return scene, EvidenceSource(clip, nothing, scene, PLAN, None).evidence(OBSERVED_AT)
+
+
+@pytest.fixture(scope="module")
+def half_hidden(tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]) -> Scene:
+    whole, truth = bottle_clip(tmp_path_factory.mktemp("split") / "clip", both_hands)
+    return fit(limited_view(whole, truth, range(6)), both_hands, replace(PLAN, stages=(SplitStage(),)))[0]
 
 
 def masked(evidence: Evidence, share: float) -> Evidence:
@@ -65,3 +71,9 @@ def test_half_a_mask_counts_a_quarter(posed: tuple[Scene, Evidence]) -> None:
     whole, half = (hands_shown(scene, masked(evidence, share)) for share in (1.0, 0.5))
     for side in whole:
         torch.testing.assert_close(half[side], 0.25 * whole[side], atol=1e-5, rtol=1e-3)
+
+
+def test_split_frees_hands_as_far_as_they_show(half_hidden: Scene) -> None:
+    for side in half_hidden.hand_splats:
+        freedom = half_hidden.hand_splats[side].freedom
+        assert freedom.min() < 0.01 and freedom.max() > 0.5
