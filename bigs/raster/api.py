@@ -96,6 +96,8 @@ def rasterization(
         InputError: a shape, dtype, value or camera that cannot be rendered.
     """
     settings = RasterSettings() if settings is None else settings
+    if not isinstance(settings, RasterSettings):
+        raise InputError(f"settings: expected RasterSettings, found {type(settings).__name__}")
     check_choice("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("camera_model", camera_model, ("pinhole", "ortho"))
     check_choice("means2d", means2d, ("values", "full", "packed"))

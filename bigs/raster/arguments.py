@@ -48,7 +48,7 @@ class Batch(NamedTuple):
 
 
 def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None) -> None:
-    """All inputs are tensors of one floating type on one device, and the mask is boolean.
+    """All inputs are dense tensors of one floating type on one device, and the mask is boolean.
 
     Raises:
         InputError: one is not; it is named.
@@ -57,6 +57,8 @@ def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None
     for name, tensor in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise InputError(f"{name}: expected a torch tensor, found {type(tensor).__name__}")
+        if tensor.layout != torch.strided:
+            raise InputError(f"{name}: expected a dense tensor, found layout {tensor.layout}")
         if tensor.dtype not in (torch.float32, torch.float64):
             raise InputError(f"{name}: expected dtype float32 or float64, found {tensor.dtype}")
         if tensor.dtype != means.dtype:
@@ -67,6 +69,8 @@ def check_kind(tensors: dict[str, torch.Tensor], pixel_mask: torch.Tensor | None
         if not isinstance(pixel_mask, torch.Tensor) or pixel_mask.dtype != torch.bool:
             found = getattr(pixel_mask, "dtype", type(pixel_mask).__name__)
             raise InputError(f"pixel_mask: expected a bool tensor, found {found}")
+        if pixel_mask.layout != torch.strided:
+            raise InputError(f"pixel_mask: expected a dense tensor, found layout {pixel_mask.layout}")
         if pixel_mask.device != means.device:
             raise InputError(
                 f"pixel_mask: expected the device of means, {means.device}, found {pixel_mask.device}"

@@ -45,8 +45,8 @@ class Call(NamedTuple):
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
-    """A numpy view of a tensor; copies only what is not contiguous."""
-    return tensor.detach().contiguous().numpy()
+    """A numpy view of a tensor; copies only what is not contiguous or is a view of another's negative."""
+    return tensor.detach().resolve_neg().contiguous().numpy()
 
 
 class _Rasterize(torch.autograd.Function):

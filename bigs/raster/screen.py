@@ -36,6 +36,8 @@ def depth_of(
     viewmats: torch.Tensor,  # [..., C, 4, 4]
 ) -> torch.Tensor:
     """Camera z of the Gaussian named in each pixel, [..., C, H, W, 1]; 0 for none."""
+    if means.shape[-2] == 0:
+        return means.new_zeros(*ids.shape, 1)
     depths = (means[..., None, :, :] * viewmats[..., 2, None, :3]).sum(-1) + viewmats[..., 2, None, 3]
     flat = ids.reshape(*ids.shape[:-2], -1).long()
     picked = depths.expand(*flat.shape[:-1], depths.shape[-1]).gather(-1, flat.clamp_min(0))

@@ -246,3 +246,14 @@ def test_arrays_in_fortran_order_are_refused(monkeypatch):
         turned[place] = np.asfortranarray(turned[place])
         with pytest.raises(ValueError, match=f"{name}: expected a C-contiguous array"):
             forward(tuple(turned), *others)
+
+
+def test_tensors_that_numpy_cannot_hold():
+    inputs = scene()
+    plain = rasterization(**inputs).colors
+    turned = {**inputs, "colors": torch._neg_view(-inputs["colors"])}
+    assert torch.equal(rasterization(**turned).colors, plain)
+    with pytest.raises(InputError, match=r"means: expected a dense tensor, found layout torch\.sparse_coo"):
+        rasterization(**{**inputs, "means": inputs["means"].to_sparse()})
+    with pytest.raises(InputError, match="settings: expected RasterSettings, found dict"):
+        rasterization(**inputs, settings={"tile_size": 16})

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -105,3 +106,95 @@ def test_leading_axes_fit_the_images() -> None:
     state = forward(inputs)[-1]
     with pytest.raises(ValueError, match="lead: expected axes for 256 values"):
         state.median_ids((2**64 - 1,), 16, 16)
+
+
+def test_any_byte_but_zero_is_true_in_a_mask() -> None:
+    inputs = arrays()
+    bits = np.random.default_rng(1).random((16, 16)) < 0.5
+    for byte in (1, 2, 3, 254, 255):
+        odd = (bits * np.uint8(byte)).view(bool)
+        for plain, found in zip(
+            forward((*inputs[:8], bits))[:5], forward((*inputs[:8], odd))[:5], strict=True
+        ):
+            assert np.array_equal(plain, found)
+    dirs, coefficients = np.ones((2, 3), np.float32), np.ones((2, 1, 3), np.float32)
+    two = np.array([2, 0], np.uint8).view(bool)
+    assert _raster.harmonics_forward(0, (dirs, coefficients, two)).reshape(2, 3).any(1).tolist() == [
+        True,
+        False,
+    ]
+
+
+def test_arrays_at_odd_addresses_and_of_other_byte_orders_are_refused() -> None:
+    inputs = arrays()
+    for index, name in enumerate(("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")):
+        changed = [*inputs]
+        changed[index] = np.ndarray(
+            inputs[index].shape, np.float32, b"\0" + inputs[index].tobytes(), offset=1
+        )
+        with pytest.raises(ValueError, match=f"{name}: expected an array aligned to its values"):
+            forward(tuple(changed))
+        changed[index] = inputs[index].astype(">f4")
+        with pytest.raises(TypeError, match=f"{name}: expected an array of float"):
+            forward(tuple(changed))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_is_told_and_does_not_wait() -> None:
+    ask = (
+        "import os, sys, numpy as np, bigs._raster as r\n"
+        "def call(): r.harmonics_forward(0, (np.ones((1, 3)), np.ones((1, 1, 3)), None))\n"
+        "call()\n"
+        "child = os.fork()\n"
+        "try: call()\n"
+        "except RuntimeError as e: print(e, flush=True)\n"
+        "if child == 0: os._exit(0)\n"
+        "os.waitpid(child, 0)"
+    )
+    told = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", ask], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert told.stdout.startswith(
+        "the rasteriser: expected the process that began to compute, found one forked"
+    )
+
+
+def test_threads_share_the_engine() -> None:
+    inputs = arrays(200)
+    weights = np.random.default_rng(2).normal(size=(16, 16, 3)).astype(np.float32)
+
+    def gradients(state: _raster.RasterState, gaussians: tuple) -> tuple:
+        return _raster.rasterize_backward(state, gaussians[:5], SHARED[:5], weights, None, (True,) * 9)[:9]
+
+    *images, shared = forward(inputs)
+    expected = (*images, *gradients(shared, inputs))
+    changing = [None if x is None else x.copy() for x in inputs]
+    busy = [np.full_like(inputs[0], value) for value in (np.nan, 1e38, 0.0, 1.0)]
+    found: list[object] = []
+
+    def calls() -> None:
+        for _ in range(20):
+            *own, state = forward(inputs)
+            results = (*own, *gradients(state, inputs))
+            found.append(all(map(np.array_equal, results, expected)))
+            found.append(all(map(np.array_equal, gradients(shared, inputs), expected[5:])))
+
+    def change() -> None:
+        for _ in range(200):
+            for values in busy:
+                changing[0][:] = values
+
+    def render_what_changes() -> None:
+        for _ in range(40):
+            try:
+                gradients(forward(tuple(changing))[-1], tuple(changing))
+            except ValueError as error:
+                found.append(str(error).startswith("means: expected finite values"))
+
+    work = [calls, calls, calls, change, render_what_changes]
+    threads = [threading.Thread(target=one) for one in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) >= 120 and all(found)

@@ -77,3 +77,11 @@ def test_nothing_seen():
     assert "render_median" not in rasterization(**inputs).info
     with pytest.raises(InputError, match="median_depth: expected False for backend 'gsplat'"):
         rasterization(**inputs, median_depth=True, backend="gsplat")
+
+
+def test_no_gaussians_have_no_median():
+    inputs = scene(n=3)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        inputs[name] = inputs[name][..., :0] if name == "opacities" else inputs[name][..., :0, :]
+    info = rasterization(**inputs, median_depth=True, means2d="packed").info
+    assert (info["median_ids"] == -1).all() and (info["render_median"] == 0).all()

@@ -1,4 +1,4 @@
-//! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied.
+//! The only place that touches numpy arrays: borrowed views in, owned vectors out, neither copied but for masks.
 
 use bigs_raster::{BatchGaussians, BatchInputs, BatchShape, Broadcast, CameraModel, Scalar};
 use numpy::{
@@ -48,10 +48,20 @@ pub(crate) fn contiguous<'a, U: Element>(
     // `as_slice` alone takes Fortran's order, too: the same values at other places.
     match array.as_slice() {
         Ok(values) if array.is_c_contiguous() => Ok(values),
+        _ if array.is_c_contiguous() => Err(PyValueError::new_err(format!(
+            "{name}: expected an array aligned to its values, found one in between"
+        ))),
         _ => Err(PyValueError::new_err(format!(
             "{name}: expected a C-contiguous array"
         ))),
     }
+}
+
+/// The values of an array of bool. Copied: numpy takes every byte but 0 for true, Rust no other than 1.
+pub(crate) fn mask(name: &str, array: &Bound<'_, PyAny>) -> PyResult<Vec<bool>> {
+    contiguous(name, &slice::<bool>(name, array)?)?;
+    let bytes: PyReadonlyArrayDyn<'_, u8> = slice(name, &array.call_method1("view", ("uint8",))?)?;
+    Ok(contiguous(name, &bytes)?.iter().map(|&byte| byte != 0).collect())
 }
 
 /// The values of an array whose last axis has D of them, in rows.
@@ -130,7 +140,7 @@ pub(crate) struct Arrays<'py, T: Element> {
     viewmats: PyReadonlyArrayDyn<'py, T>,
     ks: PyReadonlyArrayDyn<'py, T>,
     backgrounds: Option<PyReadonlyArrayDyn<'py, T>>,
-    pixel_mask: Option<PyReadonlyArrayDyn<'py, bool>>,
+    pixel_mask: Option<Vec<bool>>,
 }
 
 impl<'py, T: Scalar + Element> Arrays<'py, T> {
@@ -151,7 +161,7 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
             viewmats: slice("viewmats", &arrays.get_item(5)?)?,
             ks: slice("Ks", &arrays.get_item(6)?)?,
             backgrounds: optional(7)?.map(|item| slice("backgrounds", &item)).transpose()?,
-            pixel_mask: optional(8)?.map(|item| slice("pixel_mask", &item)).transpose()?,
+            pixel_mask: optional(8)?.map(|item| mask("pixel_mask", &item)).transpose()?,
         })
     }
 
@@ -162,7 +172,6 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
         camera_model: CameraModel,
     ) -> PyResult<(BatchShape, BatchInputs<'_, T>)> {
         let backgrounds = self.backgrounds.as_ref();
-        let pixel_mask = self.pixel_mask.as_ref();
         let inputs = BatchInputs {
             gaussians: self.gaussians.broadcast()?,
             viewmats: broadcast("viewmats", &self.viewmats, self.counts[5])?,
@@ -171,9 +180,11 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
             backgrounds: backgrounds
                 .map(|a| broadcast("backgrounds", a, self.counts[7]))
                 .transpose()?,
-            pixel_mask: pixel_mask
-                .map(|a| broadcast("pixel_mask", a, self.counts[8]))
-                .transpose()?,
+            pixel_mask: self.pixel_mask.as_deref().map(|data| Broadcast {
+                data,
+                entries: self.counts[8].0,
+                cameras: self.counts[8].1,
+            }),
         };
         let shape = BatchShape {
             entries: self.counts.iter().fold(1, |size, count| wider(size, count.0)),

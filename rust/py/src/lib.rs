@@ -1,5 +1,6 @@
 //! `bigs._raster`: the Python face of `bigs-raster`. Arrays in, arrays out; no algorithm, default or limit lives here.
 
+mod call;
 mod convert;
 mod measure;
 mod pixels;
@@ -9,10 +10,8 @@ mod sh;
 mod shape;
 mod track;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
-
 use bigs_raster::{Batch, BatchState, CameraModel, RasterError, RasterSettings, RenderMode, Wanted};
-use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
@@ -111,12 +110,9 @@ fn camera_model_named(name: &str) -> PyResult<CameraModel> {
     })
 }
 
-/// Runs the engine without the interpreter lock; a panic, which would be a bug, becomes a `RuntimeError`.
+/// Runs the engine; see [`call::run`].
 fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, RasterError> + Send) -> PyResult<R> {
-    // Entered once: from outside, every stage would wake a thread of the pool and sleep until it is done.
-    py.detach(|| catch_unwind(AssertUnwindSafe(|| rayon::scope(|_| work()))))
-        .map_err(|_| PyRuntimeError::new_err("the rasteriser failed; please report this as a bug"))?
-        .map_err(value_error)
+    call::run(py, "the rasteriser", value_error, work)
 }
 
 fn forward<'py, T: Kind>(

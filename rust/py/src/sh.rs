@@ -6,14 +6,14 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
-use crate::convert::{contiguous, gradient, is_single, rows, slice};
+use crate::convert::{self, contiguous, gradient, is_single, rows, slice};
 use crate::run;
 
 /// The arrays of a call, borrowed for as long as this lives.
 struct Arrays<'py, T: Element> {
     dirs: PyReadonlyArrayDyn<'py, T>,
     coefficients: PyReadonlyArrayDyn<'py, T>,
-    mask: Option<PyReadonlyArrayDyn<'py, bool>>,
+    mask: Option<Vec<bool>>,
 }
 
 impl<'py, T: Scalar + Element> Arrays<'py, T> {
@@ -26,7 +26,9 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
         Ok(Self {
             dirs: slice("dirs", &arrays.get_item(0)?)?,
             coefficients: slice("coeffs", &arrays.get_item(1)?)?,
-            mask: (!mask.is_none()).then(|| slice("masks", &mask)).transpose()?,
+            mask: (!mask.is_none())
+                .then(|| convert::mask("masks", &mask))
+                .transpose()?,
         })
     }
 
@@ -37,18 +39,13 @@ impl<'py, T: Scalar + Element> Arrays<'py, T> {
                 "coeffs: expected axes for bases and three colours, found shape {shape:?}"
             )));
         }
-        let mask = self
-            .mask
-            .as_ref()
-            .map(|mask| contiguous("masks", mask))
-            .transpose()?;
         let dirs = rows("dirs", &self.dirs)?;
         Harmonics::new(
             degree,
             shape[shape.len() - 2],
             dirs,
             contiguous("coeffs", &self.coefficients)?,
-            mask,
+            self.mask.as_deref(),
         )
         .map_err(crate::value_error)
     }

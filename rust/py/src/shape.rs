@@ -2,9 +2,10 @@
 
 use bigs_shape::{Cones, Empty, Facing, Judge, Kind, Samples, ShapeError, Symmetry, Vec3, Views};
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
+use crate::call;
 use crate::convert::{contiguous, gradient, rows, slice};
 
 fn refused(error: ShapeError) -> PyErr {
@@ -12,9 +13,7 @@ fn refused(error: ShapeError) -> PyErr {
 }
 
 fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, ShapeError> + Send) -> PyResult<R> {
-    py.detach(|| std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| rayon::scope(|_| work()))))
-        .map_err(|_| PyRuntimeError::new_err("measuring a shape failed; please report this as a bug"))?
-        .map_err(refused)
+    call::run(py, "measuring a shape", refused, work)
 }
 
 /// Poses and camera of T pictures, borrowed for as long as this lives.

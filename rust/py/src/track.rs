@@ -2,10 +2,11 @@
 
 use bigs_track::{Laying, Picture, Templates, TrackError};
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
+use crate::call;
 use crate::convert::{contiguous, gradient, rows, slice};
 
 /// A picture's planes, borrowed for as long as this lives.
@@ -36,9 +37,7 @@ fn refused(error: TrackError) -> PyErr {
 }
 
 fn run<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, TrackError> + Send) -> PyResult<R> {
-    py.detach(|| std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| rayon::scope(|_| work()))))
-        .map_err(|_| PyRuntimeError::new_err("laying patches failed; please report this as a bug"))?
-        .map_err(refused)
+    call::run(py, "laying patches", refused, work)
 }
 
 /// Patches about `places` `[N, 2]` of a picture `[2, H, W]`, flat: grey, slopes, weights. Raises ValueError.

@@ -175,6 +175,20 @@ fn a_batch_state_takes_only_gaussians_that_fit_it() {
 }
 
 #[test]
+fn a_batch_without_views_has_gradients_of_zeros() {
+    let mut own = Shared::new(4, 3, 9, 1);
+    own.shape.entries = 0;
+    let (images, state) = own.batch().unwrap().render().unwrap();
+    assert!(images.colors.is_empty() && state.median_ids().is_empty());
+    let v = state
+        .vjp(&own.inputs().gaussians, Some(&[]), Some(&[]), ALL)
+        .unwrap();
+    assert_eq!((v.means, v.opacities), (vec![0.0; 12], vec![0.0; 4]));
+    assert_eq!(v.viewmats, [0.0; 12]);
+    assert!(v.means2d.is_empty());
+}
+
+#[test]
 fn batches_beyond_numbers_are_refused() {
     let mut own = Shared::new(2, 3, 9, 1);
     let huge = [1 << 32, 1 << 33, 1 << 62, 1 << 63, usize::MAX];

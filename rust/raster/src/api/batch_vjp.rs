@@ -173,15 +173,22 @@ impl<T: Scalar> BatchState<T> {
                 },
             )
             .sum::<Result<usize, RasterError>>()?;
+        // Values of a part of each input, none where nobody asked.
+        let size = |wanted: bool, size: usize| if wanted { size } else { 0 };
+        let channels = self.shape.channels;
         Ok(BatchGradients {
-            means: self.shared(means, gaussians.means.layout())?,
-            quats: self.shared(quats, gaussians.quats.layout())?,
-            scales: self.shared(scales, gaussians.scales.layout())?,
-            opacities: self.shared(opacities, gaussians.opacities.layout())?,
-            colors: self.shared(colors, gaussians.colors.layout())?,
-            viewmats: self.shared(viewmats, self.viewmats)?,
+            means: self.shared(means, size(wanted.means, 3 * n), gaussians.means.layout())?,
+            quats: self.shared(quats, size(wanted.quats, 4 * n), gaussians.quats.layout())?,
+            scales: self.shared(scales, size(wanted.scales, 3 * n), gaussians.scales.layout())?,
+            opacities: self.shared(opacities, size(wanted.opacities, n), gaussians.opacities.layout())?,
+            colors: self.shared(
+                colors,
+                size(wanted.colors, channels * n),
+                gaussians.colors.layout(),
+            )?,
+            viewmats: self.shared(viewmats, size(wanted.viewmats, 12), self.viewmats)?,
             backgrounds: match self.backgrounds {
-                Some(layout) => self.shared(backgrounds, layout)?,
+                Some(layout) => self.shared(backgrounds, size(wanted.backgrounds, channels), layout)?,
                 None => backgrounds,
             },
             means2d,
@@ -190,15 +197,14 @@ impl<T: Scalar> BatchState<T> {
         })
     }
 
-    /// Sums gradients per view into gradients per part, views in order.
-    fn shared(&self, per_view: Vec<T>, layout: Layout) -> Result<Vec<T>, RasterError> {
+    /// Sums gradients per view into gradients per part of `size` values, views in order; zeros where there is no view.
+    fn shared(&self, per_view: Vec<T>, size: usize, layout: Layout) -> Result<Vec<T>, RasterError> {
         /// Elements summed by one task.
         const PART: usize = 4096;
         let views = self.shape.views();
-        if layout.count() == views || per_view.is_empty() {
+        if layout.count() == views || size == 0 {
             return Ok(per_view);
         }
-        let size = per_view.len() / views;
         let mut sums = filled_with("gradients", T::ZERO, &[layout.count(), size])?;
         for (index, part) in sums.chunks_exact_mut(size).enumerate() {
             let sharing: Vec<&[T]> = per_view
