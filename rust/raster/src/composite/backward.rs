@@ -34,6 +34,9 @@ pub(crate) struct CompositeGradients<T: Real> {
     pub(crate) tiles_skipped: usize,
 }
 
+/// Shares of an image's tiles that each thread takes at least, if there are as many tiles.
+const SHARES: usize = 32;
+
 /// The vjp of [`crate::composite::forward::composite`].
 pub(crate) fn composite_vjp<T: Vectors>(
     scene: &Scene<'_, T>,
@@ -49,9 +52,13 @@ pub(crate) fn composite_vjp<T: Vectors>(
     let values = Scattered::new(intersections.values(scene.lists.entries.len() * size));
     let mut backgrounds = vec![T::ZERO; scene.grid.len() * total];
     let tiles_skipped = AtomicUsize::new(0);
-    backgrounds.par_chunks_mut(total).enumerate().for_each_init(
-        Incoming::pooled,
-        |incoming, (tile, v_background)| {
+    // Few at a time: tiles take times that differ too much for larger shares to end together.
+    let at_once = scene.grid.len() / (SHARES * rayon::current_num_threads());
+    backgrounds
+        .par_chunks_mut(total)
+        .enumerate()
+        .with_max_len(at_once.max(1))
+        .for_each_init(Incoming::pooled, |incoming, (tile, v_background)| {
             let mut task = scene.task(tile);
             if task.entries.is_empty() {
                 if scene.background.is_some() {
@@ -99,8 +106,7 @@ pub(crate) fn composite_vjp<T: Vectors>(
             if skipped {
                 tiles_skipped.fetch_add(1, Ordering::Relaxed);
             }
-        },
-    );
+        });
     let mut background = vec![T::ZERO; scene.channels.colored];
     for tile in backgrounds.chunks_exact(total) {
         for (sum, &v) in background.iter_mut().zip(tile) {

@@ -161,8 +161,10 @@ pub(crate) fn composite<T: Vectors>(
         planes
     };
     let saturated = AtomicUsize::new(0);
+    // One by one: tiles take times that differ too much for larger shares to end together.
     strips
         .into_par_iter()
+        .with_max_len(1)
         .flat_map(|strip| rayon::iter::split(strip, |strip| strip.halves(scene)))
         .for_each_init(planes, |planes, mut strip| {
             while strip.tiles > 0 {

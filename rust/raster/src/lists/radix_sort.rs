@@ -14,6 +14,11 @@ impl<K> SortScratch<K> {
     pub(crate) fn bytes(&self) -> usize {
         bytes_of(&self.counts) + bytes_of(&self.other)
     }
+
+    /// Memory for pairs, between sorts.
+    pub(crate) fn spare(&mut self) -> &mut Vec<(K, u32)> {
+        &mut self.other
+    }
 }
 
 /// Sorts `pairs` by key; equal keys keep their order. Every bit of the key counts.

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::error::RasterError;
-use crate::lists::radix_sort::{SortScratch, radix_sort_with};
+use crate::lists::depth_order::DepthOrder;
 use crate::math::real::Real;
 use crate::memory::pool::{Buffers, bytes_of, filled, stale};
 use crate::memory::shared_slice::Shared;
@@ -30,8 +30,7 @@ impl Buffers for TileLists {
 /// What sorting and listing need besides their results.
 #[derive(Debug)]
 pub(crate) struct ListScratch<T: Real> {
-    order: Vec<(T::Key, u32)>,
-    sort: SortScratch<T::Key>,
+    order: DepthOrder<T::Key>,
     /// Per tile, where in its list the next splat from the front goes, and one past where the next from the back goes.
     fronts: Vec<u32>,
     backs: Vec<u32>,
@@ -42,8 +41,7 @@ pub(crate) struct ListScratch<T: Real> {
 impl<T: Real> Default for ListScratch<T> {
     fn default() -> Self {
         Self {
-            order: Vec::new(),
-            sort: SortScratch::default(),
+            order: DepthOrder::default(),
             fronts: Vec::new(),
             backs: Vec::new(),
             segments: Vec::new(),
@@ -53,28 +51,8 @@ impl<T: Real> Default for ListScratch<T> {
 
 impl<T: Real> Buffers for ListScratch<T> {
     fn bytes(&self) -> usize {
-        bytes_of(&self.order)
-            + self.sort.bytes()
-            + bytes_of(&self.fronts)
-            + bytes_of(&self.backs)
-            + bytes_of(&self.segments)
+        self.order.bytes() + bytes_of(&self.fronts) + bytes_of(&self.backs) + bytes_of(&self.segments)
     }
-}
-
-/// Puts the Gaussians that reach some tile in order of depth, ties by index.
-fn sort_by_depth<T: Real>(depths: &[T], covers: &[Cover], scratch: &mut ListScratch<T>) {
-    let order = stale(&mut scratch.order, depths.len());
-    let mut reached = 0;
-    for (packet, (depths, cover)) in depths.chunks(PACKET_SIZE).zip(covers).enumerate() {
-        let first = (packet * PACKET_SIZE) as u32;
-        for (local, depth) in depths.iter().enumerate() {
-            // Overwritten by the next if it reaches nothing, which is hard for a branch to predict.
-            order[reached] = (depth.key(), first + local as u32);
-            reached += usize::from(cover.reaches(local));
-        }
-    }
-    scratch.order.truncate(reached);
-    radix_sort_with(&mut scratch.order, &mut scratch.sort);
 }
 
 /// Numbers the intersections of every packet.
@@ -112,11 +90,32 @@ pub(crate) fn bin_splats<T: Real>(
 ) -> Result<(), RasterError> {
     number_intersections(projected.covers_mut())?;
     let (depths, covers) = (&projected.depths[..], projected.covers());
-    rayon::join(
-        || sort_by_depth(depths, covers, scratch),
-        || count_by_tile(covers, tiles, &mut lists.offsets),
-    );
-    fill_lists(covers, scratch, lists);
+    let intersections = covers.iter().map(Cover::count).sum();
+    let out = Lists {
+        covers,
+        entries: Shared::new(stale(&mut lists.entries, intersections)),
+    };
+    let ListScratch {
+        order,
+        fronts,
+        backs,
+        segments,
+    } = scratch;
+    // A count by segment and tile costs more than it saves where tiles outnumber intersections.
+    let threads = rayon::current_num_threads().min(1 + intersections / tiles.max(1));
+    if threads > 2 {
+        order.sort(depths, covers);
+        out.fill_by_segments(order.pairs(), segments, threads, tiles, &mut lists.offsets);
+    } else {
+        rayon::join(
+            || order.sort(depths, covers),
+            || count_by_tile(covers, tiles, &mut lists.offsets),
+        );
+        fronts.clone_from(&lists.offsets);
+        backs.clear();
+        backs.extend_from_slice(&lists.offsets[1..]);
+        out.fill_from_both_ends(order.pairs(), fronts, backs);
+    }
     Ok(())
 }
 
@@ -153,29 +152,10 @@ impl Lists<'_> {
 /// Gaussians whose tiles are asked for ahead of the one being listed: in order of depth they lie anywhere.
 const AHEAD: usize = 8;
 
-/// Lists the splats of every tile, after [`sort_by_depth`] and [`count_by_tile`].
-fn fill_lists<T: Real>(covers: &[Cover], scratch: &mut ListScratch<T>, lists: &mut TileLists) {
-    let intersections = lists.offsets.last().map_or(0, |&end| end as usize);
-    let out = Lists {
-        covers,
-        entries: Shared::new(stale(&mut lists.entries, intersections)),
-    };
-    scratch.fronts.clone_from(&lists.offsets);
-    match rayon::current_num_threads() {
-        1 | 2 => out.fill_from_both_ends(scratch, &lists.offsets),
-        threads => out.fill_by_segments(scratch, threads),
-    }
-}
-
 impl Lists<'_> {
     /// The near half from the front of each list, at the same time the far half from its back: no work more than one
     /// thread has.
-    fn fill_from_both_ends<T: Real>(&self, scratch: &mut ListScratch<T>, offsets: &[u32]) {
-        let ListScratch {
-            order, fronts, backs, ..
-        } = scratch;
-        backs.clear();
-        backs.extend_from_slice(&offsets[1..]);
+    fn fill_from_both_ends<K: Sync>(&self, order: &[(K, u32)], fronts: &mut [u32], backs: &mut [u32]) {
         let (near, far) = order.split_at(order.len() / 2);
         rayon::join(
             || self.fill_from_the_front(near, fronts),
@@ -194,16 +174,15 @@ impl Lists<'_> {
         );
     }
 
-    /// A segment of the order per thread, each where counting those before it says: one more walk through the tiles of
-    /// all Gaussians, which more than two threads make up for.
-    fn fill_by_segments<T: Real>(&self, scratch: &mut ListScratch<T>, segments: usize) {
-        let ListScratch {
-            order,
-            fronts,
-            segments: nexts,
-            ..
-        } = scratch;
-        let tiles = fronts.len() - 1;
+    /// A segment of the order per thread, each where counting those before it says.
+    fn fill_by_segments<K: Sync>(
+        &self,
+        order: &[(K, u32)],
+        nexts: &mut Vec<u32>,
+        segments: usize,
+        tiles: usize,
+        offsets: &mut Vec<u32>,
+    ) {
         let size = order.len().div_ceil(segments).max(1);
         let nexts = filled(nexts, segments * tiles, 0);
         nexts
@@ -217,10 +196,14 @@ impl Lists<'_> {
                     }
                 }
             });
-        for counts in nexts.chunks_exact_mut(tiles) {
-            for (next, front) in counts.iter_mut().zip(&mut *fronts) {
-                (*next, *front) = (*front, *front + *next);
+        offsets.clear();
+        offsets.push(0);
+        let mut sum = 0;
+        for tile in 0..tiles {
+            for next in nexts.iter_mut().skip(tile).step_by(tiles) {
+                (*next, sum) = (sum, sum + *next);
             }
+            offsets.push(sum);
         }
         nexts
             .par_chunks_mut(tiles)

@@ -1,9 +1,14 @@
 //! Arrays that a caller gets.
 
+use rayon::prelude::*;
+
 use crate::error::RasterError;
 
 /// Bytes from which memory is asked for before it is used: less is taken for granted.
 const LARGE: usize = 1 << 24;
+
+/// Bytes that one thread fills at least, where there are several.
+const FILLED_AT_ONCE: usize = 1 << 16;
 
 /// The product of sizes, or the largest number there is.
 pub(crate) fn product(sizes: &[usize]) -> usize {
@@ -16,7 +21,7 @@ pub(crate) fn product(sizes: &[usize]) -> usize {
 ///
 /// # Errors
 /// [`RasterError::OutOfMemory`].
-pub(crate) fn filled_with<U: Clone>(
+pub(crate) fn filled_with<U: Copy + Send + Sync>(
     name: &'static str,
     value: U,
     sizes: &[usize],
@@ -27,6 +32,14 @@ pub(crate) fn filled_with<U: Clone>(
     // are none.
     if bytes >= LARGE && Vec::<U>::new().try_reserve_exact(elements).is_err() {
         return Err(RasterError::OutOfMemory { name, elements });
+    }
+    if bytes >= 4 * FILLED_AT_ONCE && rayon::current_num_threads() > 1 {
+        let mut values = Vec::new();
+        let each = FILLED_AT_ONCE / size_of::<U>().max(1);
+        rayon::iter::repeat_n(value, elements)
+            .with_min_len(each)
+            .collect_into_vec(&mut values);
+        return Ok(values);
     }
     Ok(vec![value; elements])
 }

@@ -239,6 +239,18 @@ impl Cover {
         self.begins[owner + 1] = self.end as u32;
     }
 
+    /// Gaussians that reach the first tile, or none.
+    #[cfg(test)]
+    pub(crate) fn of_single_tiles(len: usize, reaches: impl Fn(usize) -> bool) -> Self {
+        let mut cover = Self::default();
+        cover.clear(len);
+        for local in (0..len).filter(|&local| reaches(local)) {
+            cover.push(local, 0, 1, None);
+        }
+        cover.finish();
+        cover
+    }
+
     /// Completes the beginnings: Gaussians that reach nothing begin where the one before ends.
     pub(crate) fn finish(&mut self) {
         let mut last = 0;
