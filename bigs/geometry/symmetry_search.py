@@ -11,9 +11,9 @@ import scipy.optimize
 
 from bigs.fused.shape import SymmetryJudge
 from bigs.geometry.coverage import sphere_directions
-from bigs.geometry.symmetry import TURNS, EmptySpace, SeenSurface, Symmetry, completed
+from bigs.geometry.symmetry import TURNS, EmptySpace, SeenSurface, Symmetry, across, completed
 
-# Number of candidates that are refined, of those that are polished, and of samples that vote.
+# Number of candidates that are refined, of those that are polished at a time, and of samples that vote.
 _FINALISTS = 14
 _POLISHED = 4
 _VOTERS = 400
@@ -21,24 +21,30 @@ _VOTERS = 400
 _EVERY = 8
 # Cosine of 35 degrees.
 _LEAST_COSINE = 0.82
+# A plane's place is searched this many tolerances to either side.
+_REACH = 8
+# Angles between mirror planes, degrees: smaller ones make a body that is nearly one of revolution.
+_BETWEEN_PLANES = np.array([45.0, 60.0, 90.0])
+# How far angles found are off, degrees.
+_SLACK = 5.0
+# Directions across a known plane in which others are looked for.
+_DIRECTIONS = 24
 # Most symmetries that are searched: three planes fill every octant.
 _MOST = 3
 
 
 @dataclass(frozen=True)
 class SymmetryConfig:
-    """When a symmetry counts as found. Lengths are shares of the object's longest side.
-
-    On six clips that show a third of their object, true mirror planes had shares of 0.72 to 0.97, and no
-    false one that was sharp had more than 0.66.
-    """
+    """When a symmetry counts as found. Lengths are shares of the object's longest side."""
 
     # A carried point meets seen surface if it is this near, with a normal within 35 degrees.
     tolerance: float = 0.02
     # Smallest share of the carried points that must meet seen surface (support).
     least_support: float = 0.12
-    # Smallest share of support in support and contradiction together.
-    least_share: float = 0.75
+    # Smallest share of support in support and contradiction together, for the first symmetry and for those
+    # after it: what the first has completed supports a wrong one as well as a right one.
+    least_share: float = 0.85
+    least_share_later: float = 0.97
     # Largest share of contradiction, absolute and relative to the support: where much was seen, wrong poses
     # and masks contradict everywhere a little.
     most_contradiction: float = 0.06
@@ -47,6 +53,9 @@ class SymmetryConfig:
     least_new: float = 0.05
     # Colours that meet must differ by less than this share of random pairs' difference.
     most_color_error: float = 0.85
+    # Colours need not agree where shape alone says enough: support, and its share, of at least this much.
+    plain_support: float = 0.4
+    plain_share: float = 0.95
     # Loss, in support less three times the contradictions, that a shift by 1.5 tolerances or a turn by 5
     # degrees must cause.
     least_sharpness: float = 0.015
@@ -70,7 +79,7 @@ def find_symmetries(
         judge = _Judge(surface, is_empty, config)
         # An axis completes more than any plane, and only a body of revolution passes as one.
         best = None if found else judge.best(_axis_candidates(surface), found)
-        best = best or judge.best(_plane_candidates(surface), found)
+        best = best or judge.best(_plane_candidates(surface) + judge.across(found), found)
         if best is None:
             break
         found.append(best)
@@ -93,6 +102,7 @@ class _Judge:
         self.config = config
         self.size = float(np.ptp(surface.points, axis=0).max())
         self.tolerance = config.tolerance * self.size
+        self.points = surface.points
         middle = np.median(surface.colors, axis=0)
         # Difference of two random colours of the surface; never so small that noise decides.
         self.chance = max(1.4 * float(np.abs(surface.colors - middle).mean()), 0.02)
@@ -125,30 +135,57 @@ class _Judge:
         order = np.argsort(-np.array(self.worths(symmetries)), kind="stable")
         return [symmetries[index] for index in order]
 
+    def across(self, known: Sequence[Symmetry]) -> list[Symmetry]:
+        """Planes at right angles to those known: two mirror planes at any other angle are rare."""
+        middle = _middle(self.points)
+        found: list[Symmetry] = []
+        for plane in known:
+            if plane.kind == "plane":
+                first, second = across(plane.direction)
+                for angle in np.arange(_DIRECTIONS) * (np.pi / _DIRECTIONS):
+                    normal = np.cos(angle) * first + np.sin(angle) * second
+                    found.append(Symmetry("plane", middle, normal))
+        return self._placed(found)
+
     def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
         """The refined candidate that agrees best; None if that is not enough."""
         if not candidates:
             return None
-        refined: list[Symmetry] = []
-        for symmetry in self.ranked(self._refined(self.ranked(candidates)[:_FINALISTS])):
-            if not any(_alike(symmetry, other, self.size) for other in (*known, *refined)):
-                refined.append(symmetry)
-        polished = [self._polished(symmetry) for symmetry in refined[:_POLISHED]]
-        for symmetry in self.ranked(polished) if polished else []:
-            (found,) = self.agreement([symmetry])
-            support, contradiction = found.support, found.contradiction
-            most = self.config.most_contradiction
-            if (
-                not any(_alike(symmetry, other, self.size) for other in known)
-                and support + contradiction <= 1.0 - self.config.least_new
-                and support >= self.config.least_support
-                and contradiction <= max(most, self.config.contradiction_per_support * support)
-                and support >= self.config.least_share * (support + contradiction)
-                and found.color <= self.config.most_color_error
-                and self._sharpness(symmetry) >= self.config.least_sharpness
-            ):
-                return replace(symmetry, support=support, contradiction=contradiction)
+        finalists = self._distinct(self.ranked(candidates), known)[:_FINALISTS]
+        refined = self._distinct(self.ranked(self._placed(self._refined(finalists))), known)
+        for first in range(0, len(refined), _POLISHED):
+            polished = [self._polished(symmetry) for symmetry in refined[first : first + _POLISHED]]
+            for symmetry in self.ranked(polished):
+                (found,) = self.agreement([symmetry])
+                if self._is_strong(symmetry, found, known):
+                    return replace(symmetry, support=found.support, contradiction=found.contradiction)
         return None
+
+    def _distinct(self, symmetries: Sequence[Symmetry], known: Sequence[Symmetry]) -> list[Symmetry]:
+        """Those that are neither known nor like one before them."""
+        kept: list[Symmetry] = []
+        for symmetry in symmetries:
+            if not any(_alike(symmetry, other, self.size) for other in (*known, *kept)):
+                kept.append(symmetry)
+        return kept
+
+    def _is_strong(self, symmetry: Symmetry, found: _Agreement, known: Sequence[Symmetry]) -> bool:
+        """Whether the evidence is enough for a symmetry that is not known yet."""
+        config = self.config
+        support, contradiction = found.support, found.contradiction
+        judged = support + contradiction
+        # Print need not continue from one side to the other: where the shape says enough, it may differ.
+        plain = support >= max(config.plain_support, config.plain_share * judged)
+        return (
+            not any(_alike(symmetry, other, self.size) for other in known)
+            and all(_compatible(symmetry, other) for other in known)
+            and judged <= 1.0 - config.least_new
+            and support >= config.least_support
+            and support >= judged * (config.least_share_later if known else config.least_share)
+            and contradiction <= max(config.most_contradiction, config.contradiction_per_support * support)
+            and (plain or found.color <= config.most_color_error)
+            and self._sharpness(symmetry) >= config.least_sharpness
+        )
 
     def _refined(self, symmetries: Sequence[Symmetry]) -> list[Symmetry]:
         """The symmetries moved to where the carried points lie on the planes of those they meet.
@@ -160,6 +197,21 @@ class _Judge:
         moved = [Symmetry(old.kind, row[:3], row[3:]) for old, row in zip(symmetries, rows, strict=True)]
         better = np.array(self.worths(moved)) > self.worths(symmetries)
         return [new if gain else old for old, new, gain in zip(symmetries, moved, better, strict=True)]
+
+    def _placed(self, symmetries: Sequence[Symmetry]) -> list[Symmetry]:
+        """Of planes parallel to each the one that agrees best; axes as they are.
+
+        A flat side says nothing of where the plane that halves it lies, its ends do, and far from the right
+        place nothing leads there.
+        """
+        places = self.config.tolerance * np.arange(-_REACH, _REACH + 1)
+        moves = [np.array([0.0, place, 0.0, 0.0]) for place in places]
+        return [
+            self.ranked([symmetry.moved(move, self.size) for move in moves])[0]
+            if symmetry.kind == "plane"
+            else symmetry
+            for symmetry in symmetries
+        ]
 
     def _polished(self, symmetry: Symmetry) -> Symmetry:
         """The symmetry moved a little to where it agrees best."""
@@ -196,6 +248,23 @@ def _alike(a: Symmetry, b: Symmetry, size: float) -> bool:
     )
 
 
+def _compatible(a: Symmetry, b: Symmetry) -> bool:
+    """Whether one object may have both.
+
+    Two mirror planes make a rotation by twice the angle between them, which a whole number of times must be
+    a full turn. An axis is taken as it comes.
+    """
+    if "axis" in (a.kind, b.kind):
+        return True
+    angle = np.degrees(np.arccos(min(abs(float(a.direction @ b.direction)), 1.0)))
+    return bool(np.abs(angle - _BETWEEN_PLANES).min() < _SLACK)
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The middle [3] of the box around points [N, 3]."""
+    return 0.5 * (points.min(0) + points.max(0))
+
+
 def _plane_candidates(surface: SeenSurface) -> list[Symmetry]:
     """Planes that many pairs of samples are mirrored by, and all directions through the box's middle."""
     rng = np.random.default_rng(0)
@@ -224,7 +293,7 @@ def _plane_candidates(surface: SeenSurface) -> list[Symmetry]:
     )
     best = cells[np.argsort(-votes, kind="stable")[:60]]
     planes = [Symmetry("plane", step * cell * bins[which], bins[which]) for which, cell in best]
-    middle = 0.5 * (surface.points.min(0) + surface.points.max(0))
+    middle = _middle(surface.points)
     return planes + [Symmetry("plane", middle, axis) for axis in bins[::4]]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +12,7 @@ from scipy.spatial import cKDTree
 from bigs.geometry.mesh import sample_surface
 from bigs.geometry.surface import distance_to_planes, empty_grid
 from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
-from bigs.geometry.symmetry_search import find_symmetries
+from bigs.geometry.symmetry_search import SymmetryConfig, find_symmetries
 
 # Where the camera stands, as seen from the object: three faces of a box show.
 VIEW = np.array([0.5, 0.6, 0.4]) / np.linalg.norm([0.5, 0.6, 0.4])
@@ -106,15 +108,39 @@ def test_a_lump_has_no_symmetry() -> None:
     assert find_symmetries(surface, outside(lump)) == []
 
 
-def test_colours_can_speak_against_a_plane() -> None:
-    """A box whose halves are of different colours is not mirrored onto itself across them."""
+def test_colours_decide_only_where_the_shape_leaves_doubt() -> None:
+    """Print need not continue from one side of a box to the other."""
+    box = trimesh.creation.box((0.12, 0.06, 0.09))
+    surface, _ = seen_of(box)
+    rng = np.random.default_rng(0)
+    printed = surface._replace(colors=rng.random(surface.colors.shape))
+    found = find_symmetries(printed, outside(box))
+    assert found
+    for plane in found:
+        assert np.abs(plane.direction).max() > np.cos(np.radians(3.0))
+    assert find_symmetries(printed, outside(box), SymmetryConfig(plain_support=1.0)) == []
+    plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
+    assert find_symmetries(plain, outside(box), SymmetryConfig(plain_support=1.0))
+
+
+def test_mirror_planes_stand_at_whole_parts_of_a_turn() -> None:
+    """A square prism has planes at 45 degrees; none are taken at angles whose rotations never close."""
+    prism = trimesh.creation.box((0.08, 0.08, 0.12))
+    surface, _ = seen_of(prism)
+    found = find_symmetries(surface, outside(prism))
+    assert len(found) >= 2
+    for first, second in itertools.combinations(found, 2):
+        angle = np.degrees(np.arccos(min(abs(first.direction @ second.direction), 1.0)))
+        assert np.abs(angle - np.array([45.0, 60.0, 90.0])).min() < 5.0
+
+
+def test_later_planes_need_more_evidence() -> None:
+    """Samples that the first plane has added support a second one whether it is right or wrong."""
     box = trimesh.creation.box((0.12, 0.06, 0.09))
     surface, _ = seen_of(box)
     plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
-    rng = np.random.default_rng(0)
-    mixed = surface._replace(colors=rng.random(surface.colors.shape))
-    assert find_symmetries(plain, outside(box))
-    assert find_symmetries(mixed, outside(box)) == []
+    assert len(find_symmetries(plain, outside(box))) > 1
+    assert len(find_symmetries(plain, outside(box), SymmetryConfig(least_share_later=1.01))) == 1
 
 
 def test_too_little_was_seen() -> None:
