@@ -36,6 +36,9 @@ class HandSplatsConfig:
     shared: bool = True
     # Standard deviation of an estimate of betas that no second hand confirms; 0 trusts it entirely.
     shape_error: float = 0.6
+    # The same of the first of betas, overall size, for either hand: a picture tells a small hand from a far
+    # one by hardly anything. 0 treats it as the others.
+    size_error: float = 0.9
     # Let the geometry field offset, rotate and scale the Gaussians. The released code freezes them.
     learn_geometry: bool = True
     # Standard deviations at the start: along the surface in units of the local spacing, across it relative to

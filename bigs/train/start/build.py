@@ -185,20 +185,24 @@ def _canonical_hands(
     if not shapes:
         return {}
     if config.shared:
-        return {"right": (right, likely_shape(list(shapes.values()), config.shape_error))}
-    return {side: (right, likely_shape([betas], config.shape_error)) for side, betas in shapes.items()}
+        return {"right": (right, likely_shape(list(shapes.values()), config.shape_error, config.size_error))}
+    return {
+        side: (right, likely_shape([betas], config.shape_error, config.size_error))
+        for side, betas in shapes.items()
+    }
 
 
-def likely_shape(estimates: Sequence[Tensor], error: float) -> Tensor:
+def likely_shape(estimates: Sequence[Tensor], error: float, size_error: float) -> Tensor:
     """The most likely betas [10] of one person given estimates of both hands, or of one.
 
     The paper takes the right hand's; two independent estimates are better averaged, and as betas have unit
     variance among people, an uncertain estimate lies too far out. How uncertain the mean is, both hands'
-    difference tells.
+    difference tells; of size it does not, as one difference is too few.
 
     Args:
         estimates: one or two shapes [10].
         error: standard deviation of one estimate where there is no second; 0 takes estimates as they are.
+        size_error: the same of the first of betas, overall size, for each estimate; 0 takes `error`.
     """
     mean = torch.stack(list(estimates)).mean(0)
     if error == 0.0:
@@ -206,7 +210,10 @@ def likely_shape(estimates: Sequence[Tensor], error: float) -> Tensor:
     variance = error**2
     if len(estimates) == 2:
         variance = float((estimates[0] - estimates[1]).square().mean()) / 4.0
-    return mean / (1.0 + variance)
+    variances = torch.full_like(mean, variance)
+    if size_error > 0.0:
+        variances[0] = size_error**2 / len(estimates)
+    return mean / (1.0 + variances)
 
 
 def _nearest_colors(points: np.ndarray, start: ObjectStart) -> np.ndarray:

@@ -60,7 +60,8 @@ def test_hands_start_at_the_estimates(scene: Scene, tiny: Clip, both_hands: dict
         assert np.linalg.norm(joints.numpy() - given.joints[side], axis=-1).max() < 0.01
     betas = np.mean([tiny.hands[side].betas for side in SIDES], axis=0)
     doubt = np.mean((tiny.hands["right"].betas - tiny.hands["left"].betas) ** 2) / 4
-    np.testing.assert_allclose(scene.betas["right"].numpy(), betas / (1 + doubt), atol=2e-2)
+    doubts = np.array([SMOKE.hand.size_error**2 / 2] + [doubt] * 9)
+    np.testing.assert_allclose(scene.betas["right"].numpy(), betas / (1 + doubts), atol=2e-2)
 
 
 def test_the_likely_shape_is_nearer_than_the_mean() -> None:
@@ -72,15 +73,32 @@ def test_the_likely_shape_is_nearer_than_the_mean() -> None:
         hands = [person + 0.8 * torch.randn(10, generator=generator) for _ in range(2)]
         for name, found in (
             ("mean", (hands[0] + hands[1]) / 2),
-            ("likely", likely_shape(hands, 0.8)),
+            ("likely", likely_shape(hands, 0.8, 0.0)),
             ("one", hands[0]),
-            ("likely one", likely_shape(hands[:1], 0.8)),
+            ("likely one", likely_shape(hands[:1], 0.8, 0.0)),
         ):
             errors[name].append(float((found - person).square().mean()))
     mean = {name: np.mean(values) for name, values in errors.items()}
-    assert torch.equal(likely_shape(hands[:1], 0.0), hands[0])
+    assert torch.equal(likely_shape(hands[:1], 0.0, 0.9), hands[0])
     assert mean["likely one"] < 0.75 * mean["one"]
     assert mean["likely"] < 0.95 * mean["mean"]
+
+
+def test_size_is_drawn_to_the_average_hand_by_its_own_error() -> None:
+    """Two estimates that agree say little of size: one difference is no measure of it."""
+    agreeing = [torch.full((10,), 2.0)] * 2
+    found = likely_shape(agreeing, 0.6, 0.9)
+    assert float(found[0]) == pytest.approx(2.0 / (1.0 + 0.9**2 / 2), rel=1e-6)
+    assert torch.equal(found[1:], torch.full((9,), 2.0))
+    generator = torch.Generator().manual_seed(1)
+    people = torch.randn(400, 10, generator=generator)
+    noise = torch.tensor([0.9] + [0.5] * 9)
+    errors = {0.0: [], 0.9: []}
+    for person in people:
+        hands = [person + noise * torch.randn(10, generator=generator) for _ in range(2)]
+        for size_error, found in errors.items():
+            found.append(float((likely_shape(hands, 0.6, size_error) - person)[0].square()))
+    assert np.mean(errors[0.9]) < 0.95 * np.mean(errors[0.0])
 
 
 @torch.no_grad()
