@@ -1,10 +1,13 @@
-"""Hand pose scores: joints relative to the wrist, and where the wrist is."""
+"""Pose scores: joints relative to the wrist, where the wrist is, and how the object is turned."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from bigs.checks import check_shape
+from bigs.geometry.rotations import robust_mean_rotation
 
 
 def mpjpe(pred: np.ndarray, gt: np.ndarray) -> np.ndarray:
@@ -68,6 +71,40 @@ def wrist_error(pred: np.ndarray, gt: np.ndarray, scale: float = 1.0) -> np.ndar
     """
     _check_joints(pred, gt)
     return 1000.0 * np.linalg.norm(scale * pred[:, 0] - gt[:, 0], axis=-1)
+
+
+def turn_errors(pred: np.ndarray, gt: np.ndarray) -> np.ndarray:
+    """Error of a rigid object's rotation in each frame, after one turn of its own frame for the whole clip.
+
+    That turn is the one on which the frames agree, since two reconstructions of an object share no axes.
+
+    Args:
+        pred: vertices [T, N, 3], the same in each frame, metres, camera frame.
+        gt: vertices [T, M, 3], likewise; any other mesh.
+
+    Returns:
+        [T] degrees; NaN where a side is not finite.
+
+    Raises:
+        InputError: another shape.
+    """
+    check_shape("pred", pred, ("T", "N", 3))
+    check_shape("gt", gt, (len(pred), "M", 3))
+    degrees = np.full(len(pred), np.nan)
+    known = np.flatnonzero(np.isfinite(pred).all(axis=(1, 2)) & np.isfinite(gt).all(axis=(1, 2)))
+    if len(known):
+        between = _turns(pred[known]).transpose(0, 2, 1) @ _turns(gt[known])
+        usual = robust_mean_rotation(torch.from_numpy(between)).numpy()
+        degrees[known] = np.degrees(Rotation.from_matrix(between @ usual.T).magnitude())
+    return degrees
+
+
+def _turns(verts: np.ndarray) -> np.ndarray:
+    """Rotations [T, 3, 3] of vertices [T, N, 3] since the first frame, by least squares."""
+    about = verts.astype(np.float64) - verts.mean(axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(about.transpose(0, 2, 1) @ about[0])
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    return u @ vt
 
 
 def _check_joints(pred: np.ndarray, gt: np.ndarray) -> None:

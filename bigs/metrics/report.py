@@ -10,7 +10,7 @@ import numpy as np
 
 from bigs.checks import InputError, check_faces, check_finite, check_shape
 from bigs.metrics.align import similarity_icp
-from bigs.metrics.pose import clip_scale, mpjpe, wrist_error
+from bigs.metrics.pose import clip_scale, mpjpe, turn_errors, wrist_error
 from bigs.metrics.shape import relative_scores
 from bigs.types import SIDES, HandObjectTrajectory, Side
 
@@ -49,6 +49,7 @@ METRICS: dict[str, Metric] = {
     "f10_icp": Metric("F10", "%", "higher"),
     "f5_cam": Metric("F5, one scale for the clip", "%", "higher"),
     "f10_cam": Metric("F10, one scale for the clip", "%", "higher"),
+    "rotation": Metric("object rotation, one turn for the clip, median", "degrees", "lower"),
     "clip_scale": Metric("the clip's one scale", "", "neither"),
     "cd_icp_arctic": Metric("CD_o as ARCTIC's evaluator prints it", "", "lower", detail=True),
     "cd_ra_sq": Metric("CD, object about its own centre", "cm²", "lower", detail=True),
@@ -84,6 +85,9 @@ def evaluate(
     pred = _matched(pred, gt)
     frames = _frame_scores(pred, gt) if of_frames is None else of_frames
     scores = {key: _mean_of_finite(values) for key, values in frames.items()}
+    if "rotation" in frames and np.isfinite(frames["rotation"]).any():
+        # A symmetric object, or one seen end on, is turned wrongly by any angle in some frames.
+        scores["rotation"] = float(np.nanmedian(frames["rotation"]))
     scores["clip_scale"] = trajectory_scale(pred, gt)
     scores |= _aligned_object_scores(pred, gt)
     return {key: scores[key] for key in METRICS if key in scores}
@@ -125,7 +129,7 @@ def _parts_of(key: str) -> list[str]:
     if key == "clip_scale":
         return []
     hands = {"r": ["right hand"], "l": ["left hand"], "h": ["right hand", "left hand"]}.get(words[-1], [])
-    return hands + (["object"] if words[0] in ("cd", "f5", "f10", "mrrpe") else [])
+    return hands + (["object"] if words[0] in ("cd", "f5", "f10", "mrrpe", "rotation") else [])
 
 
 def per_frame(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, np.ndarray]:
@@ -258,6 +262,7 @@ def _frame_scores(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[
     if pred_object is not None and gt_object is not None:
         camera = np.zeros((len(gt.frame_names), 3))
         placed = _per_frame_shape(scale * pred_object, camera, gt_object, camera)
+        scores["rotation"] = turn_errors(pred_object, gt_object)
         scores["f5_cam"], scores["f10_cam"] = placed["f5"], placed["f10"]
         centred = _per_frame_shape(pred_object, _box_centres(pred_object), gt_object, _box_centres(gt_object))
         scores["cd_ra_sq"], scores["f5_ra"], scores["f10_ra"] = (

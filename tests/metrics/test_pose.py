@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from bigs.metrics.pose import clip_scale, mpjpe, wrist_error
+from bigs.metrics.pose import clip_scale, mpjpe, turn_errors, wrist_error
 
 
 @pytest.fixture
@@ -45,3 +46,31 @@ def test_clip_scale_leaves_out_what_is_not_finite(joints):
 def test_wrist_error_is_zero_after_the_right_scale(joints):
     assert np.allclose(wrist_error(0.5 * joints, joints, 2.0), 0.0, atol=1e-9)
     assert np.allclose(wrist_error(joints + np.array([0.0, 0.006, 0.008]), joints), 10.0)
+
+
+def _turned(points, turns):
+    return np.einsum("tij,nj->tni", turns.as_matrix(), points)
+
+
+def test_turn_errors_are_what_is_left_after_one_turn_of_the_objects_frame():
+    rng = np.random.default_rng(2)
+    turns, own = Rotation.random(9, random_state=3), Rotation.random(random_state=4)
+    gt = _turned(0.1 * rng.normal(size=(40, 3)), turns) + rng.normal(size=(9, 1, 3))
+    other_mesh = 0.2 * rng.normal(size=(25, 3))
+    assert turn_errors(_turned(other_mesh, turns * own), gt) == pytest.approx(0.0, abs=1e-5)
+    off = Rotation.from_rotvec(np.radians(2.0) * np.eye(3)[[0]] * (np.arange(9) == 4)[:, None])
+    errors = turn_errors(_turned(other_mesh, off * turns * own), gt)
+    # One wrong frame of nine draws the common turn a little.
+    assert errors[4] == pytest.approx(2.0, abs=0.1)
+    assert np.delete(errors, 4) == pytest.approx(0.0, abs=0.1)
+
+
+def test_turn_errors_leave_out_what_is_not_finite():
+    rng = np.random.default_rng(5)
+    verts = _turned(rng.normal(size=(10, 3)), Rotation.random(4, random_state=6))
+    gt = verts.copy()
+    gt[0] = np.nan
+    errors = turn_errors(verts, gt)
+    assert np.isnan(errors[0])
+    assert errors[1:] == pytest.approx(0.0, abs=1e-5)
+    assert np.isnan(turn_errors(verts, np.full_like(gt, np.nan))).all()
