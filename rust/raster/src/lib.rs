@@ -133,7 +133,8 @@ pub use color::harmonics::HarmonicsGradients;
 pub use error::RasterError;
 pub use input::camera::{Camera, CameraModel, Intrinsics};
 pub use input::gaussians::Gaussians;
-pub use input::glam::{GlamTypes, OwnedGaussians};
+pub use input::glam::GlamTypes;
+pub use input::owned_gaussians::OwnedGaussians;
 pub use input::settings::{RasterSettings, RenderMode};
 #[doc(hidden)]
 pub use lists::radix_sort::radix_sort;

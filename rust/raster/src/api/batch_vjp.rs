@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::api::batch::{BatchState, split};
 use crate::api::batch_inputs::{BatchGaussians, Layout};
 use crate::backproject::gradients::ViewGradients;
-use crate::composite::backward::Cotangents;
+use crate::composite::incoming::Cotangents;
 use crate::error::RasterError;
 use crate::input::gaussians::check_length;
 use crate::memory::pool::{Buffers, Pooled, bytes_of};

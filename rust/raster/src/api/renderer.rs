@@ -1,7 +1,7 @@
 //! Single views: what a caller renders, and differentiates.
 
 use crate::backproject::gradients::ViewGradients;
-use crate::composite::backward::Cotangents;
+use crate::composite::incoming::Cotangents;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
 use crate::input::gaussians::{Gaussians, check_channels, check_finite, check_length};

@@ -3,8 +3,9 @@
 use rayon::prelude::*;
 
 use crate::api::renderer::GaussianGrads;
-use crate::composite::backward::{CompositeGradients, Cotangents};
+use crate::composite::backward::CompositeGradients;
 use crate::composite::forward::Canvas;
+use crate::composite::incoming::Cotangents;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
 use crate::input::gaussians::{Gaussians, check_channels, check_length};

@@ -3,6 +3,7 @@
 pub(crate) mod backward;
 pub(crate) mod dispatch;
 pub(crate) mod forward;
+pub(crate) mod incoming;
 pub(crate) mod intersection_gradients;
 pub(crate) mod kernel;
 pub(crate) mod median;

@@ -7,8 +7,9 @@
 
 use crate::backproject::gradients::{ViewGradients, project_view_vjp};
 use crate::color::harmonics::{HarmonicSums, HarmonicsGradients};
-use crate::composite::backward::{CompositeGradients, Cotangents, composite_vjp};
+use crate::composite::backward::{CompositeGradients, composite_vjp};
 use crate::composite::forward::{Canvas, composite};
+use crate::composite::incoming::Cotangents;
 use crate::composite::median::medians;
 use crate::composite::scene::Scene;
 use crate::error::RasterError;

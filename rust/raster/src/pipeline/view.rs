@@ -1,8 +1,8 @@
 //! One view from Gaussians to image and back: the stages in order.
 
 use crate::backproject::gradients::ViewGradients;
-use crate::composite::backward::Cotangents;
 use crate::composite::forward::Canvas;
+use crate::composite::incoming::Cotangents;
 use crate::composite::scene::Scene;
 use crate::error::RasterError;
 use crate::input::camera::Camera;
