@@ -273,6 +273,16 @@ def beyond_planes(points: NDArray[np.float64], planes: NDArray[np.float64]) -> N
     """The largest signed distance [N] of points [N, 3] to planes [M, 4]: normal and offset."""
 
 @final
+class NearestPoints:
+    """Points among which nearest ones are found. Opaque."""
+
+    def __new__(cls, points: NDArray[np.float64]) -> NearestPoints: ...
+    def of(
+        self, places: NDArray[np.float64], guesses: NDArray[np.uint32] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+        """Distance and index of the point that is nearest to each place; guesses of the indices save time."""
+
+@final
 class SymmetryJudge:
     """Judges symmetries of a surface. Opaque; symmetries are rows of a point and a direction."""
 

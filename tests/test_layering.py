@@ -55,7 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "losses": BELOW | {"geometry"},
     "guidance": BELOW | {"geometry"},
     "data": BELOW | {"geometry", "colmap"},
-    "metrics": BELOW | {"geometry"},
+    "metrics": BELOW | {"geometry", "fused"},
     "export": BELOW | {"geometry"},
     "motion": BELOW | {"geometry", "colmap", "_raster"},
     "preprocess": BELOW | {"geometry", "hand", "data", "colmap", "motion"},

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bigs.checks import check_shape
+from bigs.fused.nearest import NearestPoints
 from bigs.metrics.shape import MAX_POINTS, Chamfer, ShapeScore, chamfer, draw, shape_score
 
 # As many surface samples as in the published evaluator's alignment.
@@ -120,13 +120,16 @@ def _icp(source: np.ndarray, target: np.ndarray, starts: np.ndarray, iterations:
 
     A start rests once a round lowers its mean squared distance by less than `_TOLERANCE`.
     """
-    tree = cKDTree(target)
+    tree = NearestPoints(target)
     found, costs = starts.copy(), np.full(len(starts), np.inf)
+    # Those of the round before are mostly right.
+    index = np.zeros((len(starts), len(source)), dtype=np.uint32)
     active = np.arange(len(starts))
     for _ in range(iterations):
         rotation, translation = found[active, :3, :3], found[active, None, :3, 3]
         moved = source @ rotation.transpose(0, 2, 1) + translation
-        nearest = target[tree.query(moved, workers=-1)[1]]
+        index[active] = tree.of(moved, index[active])[1]
+        nearest = target[index[active]]
         step = _procrustes(moved, nearest)
         found[active] = step @ found[active]
         moved = moved @ step[:, :3, :3].transpose(0, 2, 1) + step[:, None, :3, 3]

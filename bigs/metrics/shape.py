@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from bigs.checks import InputError, check_shape
+from bigs.fused.nearest import NearestPoints
 
 # The evaluators draw this many vertices of each set in every frame (vertices, not surface samples).
 POINTS_PER_FRAME = 3000
@@ -118,8 +118,8 @@ def _nearest_cm(p: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         check_shape(name, points, ("N", 3))
         if len(points) == 0:
             raise InputError(f"{name}: expected at least one point, found none")
-    p_to_g, _ = cKDTree(g).query(p)
-    g_to_p, _ = cKDTree(p).query(g)
+    p_to_g, _ = NearestPoints(g).of(p)
+    g_to_p, _ = NearestPoints(p).of(g)
     return _CM * p_to_g, _CM * g_to_p
 
 

@@ -334,6 +334,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(track::cut_patches, m)?)?;
     m.add_function(wrap_pyfunction!(track::lay_patches, m)?)?;
     m.add_class::<shape::SymmetryJudge>()?;
+    m.add_class::<shape::NearestPoints>()?;
     m.add_function(wrap_pyfunction!(shape::cone_distances, m)?)?;
     m.add_function(wrap_pyfunction!(shape::times_on, m)?)?;
     m.add_function(wrap_pyfunction!(shape::times_seen, m)?)?;

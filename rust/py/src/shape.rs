@@ -1,9 +1,10 @@
 //! What views say of an object's shape: the Python face of `bigs_shape`.
 
-use bigs_shape::{Cones, Empty, Facing, Judge, Kind, Samples, ShapeError, Symmetry, Vec3, Views};
+use bigs_shape::{Cones, Empty, Facing, Judge, Kind, Neighbours, Samples, ShapeError, Symmetry, Vec3, Views};
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use pyo3::types::PyTuple;
 
 use crate::call;
 use crate::convert::{contiguous, gradient, rows, slice};
@@ -234,6 +235,46 @@ impl SymmetryJudge {
         let found = run(py, || Ok(self.judge.refined(&symmetries, size)))?;
         let flat = found.iter().flat_map(|found| [found.point, found.direction]);
         Ok(gradient(py, flat.flatten().collect()))
+    }
+}
+
+/// Points among which nearest ones are found. Opaque.
+#[pyclass(frozen, module = "bigs._raster")]
+pub(crate) struct NearestPoints {
+    tree: Neighbours,
+}
+
+#[pymethods]
+impl NearestPoints {
+    /// `points` are `[M, 3]`, at least one. Raises ValueError.
+    #[new]
+    fn new(py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let points = slice("points", points)?;
+        let points: Vec<Vec3> = rows("points", &points)?.to_vec();
+        let tree = run(py, || Neighbours::new(points))?;
+        Ok(Self { tree })
+    }
+
+    /// Distance and index of the point that is nearest to each of `places` `[N, 3]`; `guesses` `[N]` of the indices save
+    /// time. Raises ValueError.
+    #[pyo3(signature = (places, guesses=None))]
+    fn of<'py>(
+        &self,
+        py: Python<'py>,
+        places: &Bound<'py, PyAny>,
+        guesses: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        let places = slice("places", places)?;
+        let guesses = guesses
+            .map(|guesses| slice::<u32>("guesses", guesses))
+            .transpose()?;
+        let guesses = guesses
+            .as_ref()
+            .map(|guesses| contiguous("guesses", guesses))
+            .transpose()?;
+        let places: &[Vec3] = rows("places", &places)?;
+        let (distances, indices) = run(py, || self.tree.of(places, guesses))?;
+        (gradient(py, distances), gradient(py, indices)).into_pyobject(py)
     }
 }
 

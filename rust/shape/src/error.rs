@@ -12,6 +12,15 @@ impl ShapeError {
         Err(Self(format!("{what}: expected {expected} values, found {found}")))
     }
 
+    pub(crate) fn check_indices(what: &str, below: usize, indices: &[u32]) -> Result<(), Self> {
+        match indices.iter().find(|&&index| index as usize >= below) {
+            None => Ok(()),
+            Some(index) => Err(Self(format!(
+                "{what}: expected indices below {below}, found {index}"
+            ))),
+        }
+    }
+
     pub(crate) fn none(what: &str) -> Self {
         Self(format!("{what}: expected at least one value, found none"))
     }

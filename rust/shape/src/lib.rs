@@ -1,6 +1,7 @@
 //! What many views of an object say about its shape: where the cones of its silhouettes leave room ([`Views::cones`]),
 //! what of its surface showed and what hid nothing ([`Views::times_seen`], [`Views::times_empty`]), how far places are
-//! beyond planes ([`beyond_planes`]), and what a symmetry carries onto what was seen ([`Judge`]).
+//! beyond planes ([`beyond_planes`]), what a symmetry carries onto what was seen ([`Judge`]), and which points of one shape
+//! are nearest to those of another ([`Neighbours`]).
 //!
 //! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
 //! shared among rayon's threads in pieces of a fixed size, and sums have a fixed order, so that the number of threads
@@ -23,6 +24,7 @@ mod depths;
 mod error;
 mod judge;
 mod nearest;
+mod neighbours;
 mod planes;
 mod refine;
 mod symmetry;
@@ -32,6 +34,7 @@ pub use cones::Cones;
 pub use depths::Facing;
 pub use error::ShapeError;
 pub use judge::{Agreement, Empty, Judge, Samples};
+pub use neighbours::Neighbours;
 pub use planes::beyond_planes;
 pub use symmetry::{Kind, Symmetry};
 pub use views::Views;

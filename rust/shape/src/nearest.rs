@@ -51,16 +51,26 @@ impl Nearest {
 
     /// Index of the point that is nearest to a place, if it is nearer than `reach`.
     pub(crate) fn within(&self, place: Vec3, reach: f64) -> Option<usize> {
-        let mut best = (reach * reach, None);
-        self.look(0, 0, self.points.len(), place, &mut best);
-        best.1
+        self.nearer(place, (reach * reach, None)).1
     }
 
-    fn look(&self, node: usize, begin: usize, end: usize, place: Vec3, best: &mut (f64, Option<usize>)) {
+    /// Squared distance and index of the nearest point, or `best` if none is nearer than that.
+    pub(crate) fn nearer(&self, place: Vec3, mut best: (f64, Option<usize>)) -> (f64, Option<usize>) {
+        self.look((0, 0, self.points.len()), place, [0.0; 3], &mut best);
+        best
+    }
+
+    /// `beyond` is how far the place is out of the node's part of space along each axis, squared.
+    fn look(
+        &self,
+        (node, begin, end): (usize, usize, usize),
+        place: Vec3,
+        beyond: Vec3,
+        best: &mut (f64, Option<usize>),
+    ) {
         if end - begin <= LEAF {
             for (point, index) in &self.points[begin..end] {
-                let away = [0, 1, 2].map(|i| point[i] - place[i]);
-                let squared = away[0] * away[0] + away[1] * away[1] + away[2] * away[2];
+                let squared = squared_distance(*point, place);
                 if squared < best.0 {
                     *best = (squared, Some(*index));
                 }
@@ -68,17 +78,25 @@ impl Nearest {
             return;
         }
         let (axis, split) = self.splits[node];
-        let beyond = place[axis] - split;
+        let away = place[axis] - split;
         let half = begin + (end - begin) / 2;
         let (lower, upper) = ((2 * node + 1, begin, half), (2 * node + 2, half, end));
-        let (first, second) = if beyond < 0.0 {
+        let (first, second) = if away < 0.0 {
             (lower, upper)
         } else {
             (upper, lower)
         };
-        self.look(first.0, first.1, first.2, place, best);
-        if beyond * beyond < best.0 {
-            self.look(second.0, second.1, second.2, place, best);
+        self.look(first, place, beyond, best);
+        let mut beyond = beyond;
+        beyond[axis] = away * away;
+        if beyond[0] + beyond[1] + beyond[2] < best.0 {
+            self.look(second, place, beyond, best);
         }
     }
+}
+
+/// Of two places.
+pub(crate) fn squared_distance(a: Vec3, b: Vec3) -> f64 {
+    let away = [0, 1, 2].map(|i| a[i] - b[i]);
+    away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
 }
