@@ -12,10 +12,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from bigs.motion.schur import Observations, System, linearise, point_steps, reduce, sort_observations
+from bigs.motion.schur import (
+    Observations,
+    System,
+    linearise,
+    point_steps,
+    pose_steps,
+    reduce,
+    sort_observations,
+)
 
 
 @dataclass(frozen=True)
@@ -273,7 +280,7 @@ _SECOND = (1.0, -2.0, 1.0)
 def _step(problem: _Problem, bundle: Bundle, system: System, damping: float) -> Bundle:
     """One damped Gauss-Newton step."""
     reduced = reduce(system, problem.seen, damping)
-    change = scipy.linalg.solve(reduced.matrix, -reduced.gradient, assume_a="sym").reshape(-1, 6)
+    change = pose_steps(reduced)
     rotations, transl, points = bundle.rotations.copy(), bundle.transl.copy(), bundle.points.copy()
     free = problem.free
     rotations[free] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotations[free]

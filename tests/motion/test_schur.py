@@ -88,3 +88,15 @@ def test_points_are_eliminated_exactly(
     whole = np.linalg.solve(matrix, -gradient)
     np.testing.assert_allclose(change, whole[own], atol=1e-4 * np.abs(whole).max())
     np.testing.assert_allclose(steps.ravel(), whole[rest], atol=1e-4 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("least", [0.5, -0.5], ids=["positive", "with a negative direction"])
+def test_pose_steps_solve_the_reduced_equations(least: float) -> None:
+    """Also where rounding has left a negative direction, which a Cholesky factor cannot have."""
+    rng = np.random.default_rng(4)
+    axes = np.linalg.qr(rng.standard_normal((12, 12)))[0]
+    matrix = axes @ np.diag([least, *np.linspace(1.0, 4.0, 11)]) @ axes.T
+    reduced = schur.Reduced(matrix, rng.standard_normal(12), [])
+    steps = schur.pose_steps(reduced)
+    assert steps.shape == (2, 6)
+    np.testing.assert_allclose(matrix @ steps.ravel(), -reduced.gradient, atol=1e-12)
