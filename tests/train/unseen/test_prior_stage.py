@@ -116,7 +116,7 @@ def test_the_clips_frames_hold_what_they_show(
     found = replace(evidence, targets=replace(evidence.targets, images=step.together.colors.detach()))
     changes = []
     for weight in (0.0, 1.0):
-        stage = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, frame_weight=weight)
+        stage = replace(STAGE, steps=24, lr_shift=2e-3, damage=1e9, frame_weight=weight)
         scene, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), stage)), prior)
         assert "moved" in report.facts["prior"]
         changes.append(image_error(scene, found, ("object",), every))
