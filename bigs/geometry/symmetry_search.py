@@ -79,7 +79,7 @@ def find_symmetries(
         judge = _Judge(surface, is_empty, config)
         # An axis completes more than any plane, and only a body of revolution passes as one.
         best = None if found else judge.best(_axis_candidates(surface), found)
-        best = best or judge.best(_plane_candidates(surface) + judge.across(found), found)
+        best = best or judge.best(_plane_candidates(surface) + judge.planes_across(found), found)
         if best is None:
             break
         found.append(best)
@@ -135,7 +135,7 @@ class _Judge:
         order = np.argsort(-np.array(self.worths(symmetries)), kind="stable")
         return [symmetries[index] for index in order]
 
-    def across(self, known: Sequence[Symmetry]) -> list[Symmetry]:
+    def planes_across(self, known: Sequence[Symmetry]) -> list[Symmetry]:
         """Planes at right angles to those known: two mirror planes at any other angle are rare."""
         middle = _middle(self.points)
         found: list[Symmetry] = []

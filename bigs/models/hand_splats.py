@@ -37,7 +37,7 @@ class HandSplatsConfig:
     # Standard deviation of an estimate of betas that no second hand confirms; 0 trusts it entirely.
     shape_error: float = 0.6
     # The same of the first of betas, overall size, for either hand: a picture tells a small hand from a far
-    # one by hardly anything. 0 treats it as the others.
+    # one by hardly anything. 0 treats it as the others, as does a `shape_error` of 0.
     size_error: float = 0.9
     # Let the geometry field offset, rotate and scale the Gaussians. The released code freezes them.
     learn_geometry: bool = True

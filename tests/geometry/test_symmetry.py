@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from bigs.geometry import symmetry_search
 from bigs.geometry.mesh import sample_surface
 from bigs.geometry.surface import distance_to_planes, empty_grid
 from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
@@ -132,6 +133,16 @@ def test_mirror_planes_stand_at_whole_parts_of_a_turn() -> None:
     for first, second in itertools.combinations(found, 2):
         angle = np.degrees(np.arccos(min(abs(first.direction @ second.direction), 1.0)))
         assert np.abs(angle - np.array([45.0, 60.0, 90.0])).min() < 5.0
+
+
+def test_planes_at_other_angles_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If no two planes could stand at right angles, a box would keep its first alone."""
+    box = trimesh.creation.box((0.12, 0.06, 0.09))
+    surface, _ = seen_of(box)
+    plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
+    assert len(find_symmetries(plain, outside(box))) > 1
+    monkeypatch.setattr(symmetry_search, "_BETWEEN_PLANES", np.array([20.0]))
+    assert len(find_symmetries(plain, outside(box))) == 1
 
 
 def test_later_planes_need_more_evidence() -> None:
