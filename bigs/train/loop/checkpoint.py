@@ -50,7 +50,7 @@ def save_checkpoint(
     position: dict[str, Any] = {"stage": stage, "step": None}
     if state is not None:
         position |= {key: getattr(state, key) for key in NUMBERS}
-        for index, moments in state.optimizer.state_dict()["state"].items():
+        for index, moments in state.optimizer.moments().items():
             tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
         tensors |= {f"found.{name}": value for name, value in state.found.items()}
         if state.pull is not None:

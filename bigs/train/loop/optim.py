@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Literal
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from bigs.checks import InputError, expected_among
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import Scene
+from bigs.train.loop.adam import FrameAdam
 
 _LIGHT = {"light": "clip", "shade": "shade"}
 # Group name -> its parameters, below a hand's or the object's modules.
@@ -93,35 +93,6 @@ def _parameters(owner: nn.Module | nn.Parameter) -> Iterable[nn.Parameter]:
     return [owner] if isinstance(owner, nn.Parameter) else owner.parameters()
 
 
-class FrameAdam(torch.optim.Adam):
-    """Adam in whose groups marked `per_frame` a frame that is not in the step keeps its values and moments.
-
-    Plain Adam moves it on by its momentum, and by what the terms over the whole clip say of it alone.
-    """
-
-    @torch.no_grad()
-    def step_frames(self, frames: Tensor) -> None:
-        """One step that looked at `frames` [B] of the clip."""
-        kept = []
-        for group in self.param_groups:
-            for parameter in group["params"] if group["per_frame"] else ():
-                if parameter.grad is None:
-                    continue
-                others = torch.ones(len(parameter), dtype=torch.bool)
-                others[frames] = False
-                state = self.state.get(parameter, {})
-                moments = {
-                    name: state[name][others] if name in state else torch.zeros_like(parameter[others])
-                    for name in ("exp_avg", "exp_avg_sq")
-                }
-                kept.append((parameter, others, parameter[others], moments))
-        self.step()
-        for parameter, others, values, moments in kept:
-            parameter[others] = values
-            for name, rows in moments.items():
-                self.state[parameter][name][others] = rows
-
-
 def make_optimizer(
     scene: Scene,
     lrs: Mapping[str, float],
@@ -143,11 +114,11 @@ def make_optimizer(
             groups.append(
                 {"params": parameters, "lr": lr, "start_lr": lr, "name": name, "per_frame": per_frame}
             )
-    return FrameAdam(groups, betas=betas, eps=1e-15, fused=True)
+    return FrameAdam(groups, betas, eps=1e-15)
 
 
 def set_rates(
-    optimizer: torch.optim.Optimizer,
+    optimizer: FrameAdam,
     progress: float,
     final: float,
     caution: float = 1.0,

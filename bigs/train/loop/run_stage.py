@@ -14,6 +14,7 @@ from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.scene import Scene
+from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.density import Pull, densified
 from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_rates
 from bigs.train.loop.step import Evidence, Selection, Step
@@ -37,7 +38,7 @@ class StageState(NamedTuple):
     """The state needed to continue a stage exactly: steps done, and the optimiser with its moments."""
 
     step: int
-    optimizer: torch.optim.Optimizer
+    optimizer: FrameAdam
     best: float  # smoothed loss that the stopping rule compares with
     best_step: int
     smoothed: float
@@ -46,9 +47,7 @@ class StageState(NamedTuple):
     pull: Pull | None  # gradients at the object's Gaussians since the last densification
 
     @classmethod
-    def begun(
-        cls, step: int, optimizer: torch.optim.Optimizer, found: Mapping[str, Tensor] | None = None
-    ) -> StageState:
+    def begun(cls, step: int, optimizer: FrameAdam, found: Mapping[str, Tensor] | None = None) -> StageState:
         """After `step` steps, of whose losses nothing is known yet."""
         return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {}, None)
 
@@ -128,7 +127,7 @@ def run_stage(
     if densify is not None:
         state = state._replace(pull=Pull.none(len(_field_of_object(scene, stage).base_points)))
     if resume is not None:
-        optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
+        optimizer.set_moments(resume["moments"])
         state = state._replace(**{key: resume[key] for key in NUMBERS}, pull=resume["pull"])
 
     entities = stage_entities(scene, stage)
@@ -160,7 +159,7 @@ def run_stage(
         values, problem = _evaluate(step, terms)
         loss = weighted_sum(values, stage.weights) if problem is None else None
         if loss is not None:
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad()
             loss.backward()
             if stage.free_frames:
                 _spare_grasps(scene)
@@ -265,21 +264,17 @@ class _Kept:
     def __init__(self, scene: Scene, state: StageState) -> None:
         self._state = state
         self._anchors = None if state.pull is None else scene.object_splats.anchors
-        self._values = [p.detach().clone() for p in _trained(state.optimizer)]
-        self._moments = copy.deepcopy(state.optimizer.state_dict()["state"])
+        self._values = [p.detach().clone() for p in state.optimizer.parameters()]
+        self._moments = copy.deepcopy(state.optimizer.moments())
 
     @torch.no_grad()
-    def restore(self, scene: Scene, optimizer: torch.optim.Optimizer) -> StageState:
+    def restore(self, scene: Scene, optimizer: FrameAdam) -> StageState:
         if self._anchors is not None:
             scene.object_splats.place(self._anchors)
-        for parameter, value in zip(_trained(optimizer), self._values, strict=True):
+        for parameter, value in zip(optimizer.parameters(), self._values, strict=True):
             parameter.copy_(value)
-        optimizer.load_state_dict(optimizer.state_dict() | {"state": copy.deepcopy(self._moments)})
+        optimizer.set_moments(self._moments)
         return self._state
-
-
-def _trained(optimizer: torch.optim.Optimizer) -> list[Tensor]:
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def _advance(stage: OptimizeStage, state: StageState, loss: float) -> StageState:

@@ -25,6 +25,7 @@ from bigs.guidance.sds import sds_loss
 from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail
 from bigs.raster.settings import RasterSettings
+from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.run_stage import StageState
 from bigs.train.loop.virtual_views import render_object
 from bigs.train.plan.config import GuidanceStage
@@ -122,13 +123,13 @@ def guide_object(
     before = faults()
     for parameter in parameters.values():
         parameter.requires_grad_(True)
-    optimizer = torch.optim.Adam(
+    optimizer = FrameAdam(
         [{"params": [parameters[name]], "lr": lr} for name, lr in rates.items()], betas=(0.9, 0.99)
     )
     done = 0
     if resume is not None:
         done = resume["step"]
-        optimizer.load_state_dict(optimizer.state_dict() | {"state": resume["moments"]})
+        optimizer.set_moments(resume["moments"])
         _fill(parameters, resume["reached"])
     for step in range(done, stage.steps):
         # A function of seed and step, so that a resumed run draws the same.
@@ -150,7 +151,7 @@ def guide_object(
         loss = prior + stage.smooth * rough[unseen].square().sum()
         if frame_loss is not None:
             loss = loss + frame_loss(canonical, generator)
-        optimizer.zero_grad(set_to_none=True)
+        optimizer.zero_grad()
         loss.backward()
         for parameter in parameters.values():
             parameter.grad[coverage.seen] = 0.0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 
@@ -14,6 +16,7 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
+from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.optim import FIELD_GROUPS, GROUPS, group_parameters, make_optimizer, set_rates
 from bigs.train.plan.presets import SMOKE
 from bigs.train.start.build import build_scene
@@ -99,7 +102,7 @@ def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side,
     others = list(range(1, scene.n_frames))
 
     def step(frame: int) -> None:
-        optimizer.zero_grad(set_to_none=True)
+        optimizer.zero_grad()
         # As a prior over time has it, every frame has a gradient.
         (turns.sum() + depths.sum() + scene.object_poses.orient.sum()).backward()
         optimizer.step_frames(torch.tensor([frame]))
@@ -119,12 +122,43 @@ def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side,
 
 def test_a_step_on_all_frames_is_plain_adam(both_hands: dict[Side, HandModel]) -> None:
     poses = []
-    for step_all in (True, False):
+    for plain in (True, False):
         scene = cube_scene(both_hands)
         optimizer = make_optimizer(scene, {"hand.pose": 0.1}, frame_moments=True)
+        pose = scene.hand_poses["right"].pose
+        torchs = torch.optim.Adam(optimizer.parameters(), lr=0.1, betas=(0.9, 0.99), eps=1e-15, fused=True)
         for _ in range(3):
-            optimizer.zero_grad(set_to_none=True)
-            (scene.hand_poses["right"].pose - 1.0).square().sum().backward()
-            optimizer.step_frames(torch.arange(scene.n_frames)) if step_all else optimizer.step()
-        poses.append(scene.hand_poses["right"].pose.detach())
+            optimizer.zero_grad()
+            (pose - 1.0).square().sum().backward()
+            torchs.step() if plain else optimizer.step_frames(torch.arange(scene.n_frames))
+        poses.append(pose.detach())
     assert torch.equal(*poses) and torch.all(poses[0] != 0)
+
+
+def test_moments_go_on_elsewhere_as_copies() -> None:
+    def descend(parameter: torch.nn.Parameter, optimizer: FrameAdam) -> None:
+        optimizer.zero_grad()
+        (parameter - 1.0).square().sum().backward()
+        optimizer.step()
+
+    one, idle = torch.nn.Parameter(torch.zeros(3)), torch.nn.Parameter(torch.zeros(2))
+    first = FrameAdam([{"params": [idle], "lr": 1.0}, {"params": [one], "lr": 0.1}])
+    descend(one, first)
+    other = torch.nn.Parameter(one.detach().clone())
+    second = FrameAdam([{"params": [idle], "lr": 1.0}, {"params": [other], "lr": 0.1}])
+    second.set_moments(first.moments())
+    assert list(second.moments()) == [1]
+    descend(other, second)
+    assert float(first.moments()[1]["step"]) == 1.0
+    descend(one, first)
+    assert torch.equal(one, other)
+
+
+def test_the_optimiser_needs_no_compiler() -> None:
+    code = (
+        "import sys, torch; from bigs.train.loop.adam import FrameAdam; "
+        "p = torch.nn.Parameter(torch.ones(2)); o = FrameAdam([{'params': [p], 'lr': 0.1}]); "
+        "p.sum().backward(); o.step(); o.zero_grad(); o.set_moments(o.moments()); "
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
