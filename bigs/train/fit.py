@@ -42,7 +42,7 @@ from bigs.train.resolve import asks_prior
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
 from bigs.train.start.object_motion import find_object_motion, in_words
-from bigs.train.unseen.stages import OBSERVED_AT, run_completion, run_guidance
+from bigs.train.unseen.stages import OBSERVED_AT, finish_mesh, run_completion, run_guidance
 from bigs.train.unseen.visibility import hands_shown
 from bigs.types import Side
 
@@ -206,14 +206,10 @@ def fit(
                 report.facts["object Gaussians"] = f"{gaussians} at the start, {now} after {stage.name}"
         keep(index + 1, None)
         show(stage.name, None)
-    report.seconds = watch.read()
+    watch.begin("object mesh")
     scene.requires_grad_(False)
-    if start.known and not report.completed:
-        scene.replace_surface(start.known.of(scene.object_surface))
-        report.facts["object mesh"] = (
-            f"open: {start.known.left_out:.0%} of it would be further than "
-            f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
-        )
+    report.facts |= finish_mesh(scene, start, sources, config, report.completed)
+    report.seconds = watch.read()
     return scene, report
 
 

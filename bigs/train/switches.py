@@ -189,6 +189,10 @@ _INGREDIENTS = {
         "the completion of the object where it was never seen",
         _no_prior,
     ),
+    "openings": Switch(
+        "openings of the object's mesh, through which hands are seen",
+        lambda config: replace(config, openings=None),
+    ),
     "smooth": Switch(
         "the hands' motion: the smoothing of their estimates, L_smt, acceleration of the joints",
         _all_of(_terms("smooth", "acceleration"), _smooth),

@@ -187,6 +187,20 @@ class GuidanceStage:
     unlike: float = 1.2
 
 
+@dataclass(frozen=True)
+class OpeningConfig:
+    """When the object's mesh is opened where hands are seen through it (see `train.unseen.openings`)."""
+
+    # A hand that shows further than this behind the surface is seen through it, metres: more than a hand's
+    # depth is usually wrong by.
+    depth: float = 0.012
+    # Frames that must show it, and the least area of what they prove to be open, square metres.
+    frames: int = 5
+    area: float = 1e-4
+    # Surface nearer than this to a measured point is there, metres.
+    measured: float = 0.004
+
+
 Stage = (
     OptimizeStage
     | ObjectMotionStage
@@ -212,6 +226,8 @@ class RunConfig:
     # Eq. 8's distance of centres, or the distance of surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
     prior: PriorConfig = field(default_factory=PriorConfig)
+    # Open the object's mesh where hands are seen through it; None leaves it closed.
+    openings: OpeningConfig | None = field(default_factory=OpeningConfig)
     # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
     perceptual_weights: tuple[str, ...] = ()
     stages: tuple[Stage, ...] = ()

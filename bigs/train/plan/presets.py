@@ -263,23 +263,24 @@ DEMO = replace(
     ),
 )
 
-# More steps and finer images, in about five minutes.
+# Finer images and fields, and more steps where colours decide. Silhouettes alone get their steps of `fast`:
+# more of them bend hidden fingers and change the hands' size to fit what masks do not tell.
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
     object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
     stages=(
         ObjectMotionStage(),
-        replace(_HANDS_COARSE, steps=100),
-        replace(_HANDS_FINE, steps=200),
+        _HANDS_COARSE,
+        _HANDS_FINE,
         ScaleSearchStage(),
         GraspStage(),
-        replace(_GRASPED, steps=100),
+        _GRASPED,
         replace(_APPEARANCE, steps=200),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
-        replace(_CONTACT, steps=100),
-        replace(_REGRASP, steps=200),
+        _CONTACT,
+        _REGRASP,
         SplitStage(),
         replace(_JOINT, steps=300),
         replace(_DETAIL, steps=1000, image_size=640),
@@ -327,6 +328,7 @@ PAPER = RunConfig(
     object=ObjectSplatsConfig(triplane=TriplaneConfig(), n_gaussians=10_000, max_offset=_NO_CAP),
     lighting=False,
     contact="center",
+    openings=None,
     stages=(
         OptimizeStage(
             name="hands",

@@ -20,6 +20,7 @@ from bigs.raster.settings import RasterSettings
 from bigs.train.plan.config import (
     GraspStage,
     GuidanceStage,
+    OpeningConfig,
     OptimizeStage,
     RunConfig,
     ScaleSearchStage,
@@ -96,6 +97,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "min_transmittance": Range(0.0, 0.999),
     },
     CompletionConfig: {"enough": _SHARE},
+    OpeningConfig: {"frames": _COUNT},
     OptimizeStage: {"image_size": _PIXELS, "final_lr": _SHARE, "adam_betas": Range(0.0, 0.9999999)},
     ScaleSearchStage: {
         "span": Range(0.0, 0.999),

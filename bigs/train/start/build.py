@@ -50,6 +50,7 @@ class SceneStart(NamedTuple):
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
     symmetries: list[Symmetry]  # of the object, where they were looked for
     known: KnownPart | None  # of the object's surface, if that is not all
+    measured: np.ndarray  # [N, 3] measured points of the object, metres; none without an object
 
 
 def build_scene(
@@ -85,6 +86,7 @@ def build_scene(
     skipped: list[str] = []
     symmetries: list[Symmetry] = []
     known = None
+    measured = np.empty((0, 3))
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = object_in_camera(clip, initial)
@@ -93,6 +95,7 @@ def build_scene(
             start = smooth_object(start, initial.smooth_object)
         else:
             start = with_motion(start, motion)
+        measured = start.points if motion is None else motion.points
         surfaces = _object_surfaces(clip, unknown, start, initial, completion)
         skipped, symmetries, known = surfaces.skipped, surfaces.symmetries, surfaces.known
         verts, faces = surfaces.closed
@@ -120,7 +123,7 @@ def build_scene(
         lighting=Lighting(present, n_frames) if lighting else None,
         **object_parts,
     )
-    return SceneStart(scene, skipped, symmetries, known)
+    return SceneStart(scene, skipped, symmetries, known, measured)
 
 
 # A mesh that would lose less of its area stays closed.

@@ -11,6 +11,8 @@ from bigs.models.scene import Scene
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageState
 from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig
+from bigs.train.start.build import SceneStart
+from bigs.train.unseen.openings import openings, without_openings
 from bigs.train.unseen.prior_stage import guide_scene
 from bigs.train.unseen.symmetry_stage import StageOutcome, complete_scene
 
@@ -60,3 +62,29 @@ def run_guidance(
 
     evidence = sources.evidence(OBSERVED_AT)
     return guide_scene(scene, evidence, denoiser, stage, config.seed + 1000 * index, resume, after_step)
+
+
+def finish_mesh(
+    scene: Scene, start: SceneStart, sources: EvidenceSource, config: RunConfig, completed: bool
+) -> dict[str, str]:
+    """Leave out of the object's mesh what nothing supports and what hands refute; returns facts to report.
+
+    `completed` says that symmetry completed it, which supports all of it.
+    """
+    facts: dict[str, str] = {}
+    surface = scene.object_surface
+    if surface is None:
+        return facts
+    if start.known and not completed:
+        surface = start.known.of(surface)
+        facts["object mesh"] = (
+            f"open: {start.known.left_out:.0%} of it would be further than "
+            f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
+        )
+    if config.openings is not None and scene.sides:
+        found = openings(scene, surface, sources.evidence(OBSERVED_AT), start.measured, config.openings)
+        if found.any():
+            surface = without_openings(surface, found)
+            facts["object openings"] = f"{found.mean():.0%} of the mesh, where hands are seen through it"
+    scene.replace_surface(surface)
+    return facts

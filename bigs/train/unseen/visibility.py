@@ -16,7 +16,7 @@ from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.types import Entity, Side
 
 # Typical error of poses, metres.
-_TOLERANCE = 0.006
+TOLERANCE = 0.006
 # A Gaussian with at least this weight in some frame's picture, in pixels, shows.
 SHOWS = 0.002
 # Number of frames that are rendered together: fewer calls, but little memory.
@@ -40,7 +40,7 @@ def object_views(scene: Scene, evidence: Evidence) -> ObjectViews:
 def frames_seen(canonical: CanonicalObject, views: ObjectViews) -> np.ndarray:
     """In how many frames [N] each of the object's Gaussians shows."""
     points = canonical.means.numpy().astype(np.float64)
-    return times_seen(views, points, canonical.normals.numpy(), points, _TOLERANCE)
+    return times_seen(views, points, canonical.normals.numpy(), points, TOLERANCE)
 
 
 def guard_frames(n_frames: int, most: int = _GUARD_FRAMES) -> Tensor:

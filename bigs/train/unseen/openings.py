@@ -1,0 +1,147 @@
+"""Openings: a closed surface has a lid where the object has none, and hands are seen through it."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+import scipy.spatial
+import torch
+
+from bigs.fused.shape import times_empty
+from bigs.geometry.coverage import ObjectViews, seen_in
+from bigs.geometry.mesh import face_areas, sample_surface, vertex_normals
+from bigs.models.scene import ObjectSurface, Scene
+from bigs.train.loop.step import Evidence
+from bigs.train.plan.config import OpeningConfig
+from bigs.train.unseen.visibility import TOLERANCE, object_views
+
+# Samples of a hand's surface that may show, and of the object's that may hide it.
+_HAND_SAMPLES, _OCCLUDERS = 8000, 20_000
+# A hand's outline may be wrong by so many pixels.
+_MARGIN = 2
+# Brightness is compared as a ratio; this much of full brightness is noise.
+_DARK = 0.02
+# How a vertex' brightness varies is the median of so many vertices around it.
+_AROUND = 32
+# Frames that must show a vertex before its brightness says anything.
+_LEAST_SHOWN = 5
+
+
+def openings(
+    scene: Scene, surface: ObjectSurface, evidence: Evidence, measured: np.ndarray, config: OpeningConfig
+) -> np.ndarray:
+    """Which vertices [V] (bool) of the object's surface lie in openings.
+
+    Where a hand that the masks show lies behind surface, that surface cannot be there. The opening goes on
+    from there as far as nothing was measured and brightness varies over time as it does where a picture was
+    painted on the wrong place.
+
+    Args:
+        scene: has an object and hands; its poses are final.
+        surface: of the object.
+        evidence: the clip at the size at which to look.
+        measured: points [N, 3] of the object that were measured, metres.
+        config: see there.
+    """
+    verts, faces = surface.verts.double().numpy(), surface.faces.numpy()
+    views = object_views(scene, evidence)
+    unmeasured = scipy.spatial.cKDTree(measured).query(verts)[0] > config.measured
+    proven = unmeasured & (_hands_behind(scene, evidence, views, verts, config.depth) >= config.frames)
+    area = _vertex_areas(verts, faces)
+    if area[proven].sum() < config.area:
+        return np.zeros(len(verts), dtype=bool)
+    varies = _variation(scene, evidence, views, verts, faces)
+    usual = np.nanmedian(varies[~unmeasured]) if np.isfinite(varies[~unmeasured]).any() else np.inf
+    # Comparisons with what is not known are false.
+    open_ = proven | (unmeasured & (varies > usual))
+    patches = _patches(faces, open_)
+    proof = np.bincount(patches, np.where(proven, area, 0.0)[open_])
+    open_[open_] = (proof >= config.area)[patches]
+    return open_
+
+
+def without_openings(surface: ObjectSurface, open_: np.ndarray) -> ObjectSurface:
+    """A surface without the vertices [V] (bool) that lie in openings, and without their faces."""
+    faces = surface.faces.numpy()
+    used, kept = np.unique(faces[~open_[faces].any(axis=1)], return_inverse=True)
+    return ObjectSurface(surface.verts[torch.as_tensor(used)], torch.as_tensor(kept.reshape(-1, 3)))
+
+
+def _hands_behind(
+    scene: Scene, evidence: Evidence, views: ObjectViews, verts: np.ndarray, depth: float
+) -> np.ndarray:
+    """In how many frames [V] a hand shows more than `depth` behind vertices [V, 3]; each hand counts."""
+    posed = scene.at(torch.arange(scene.n_frames))
+    count = np.zeros(len(verts), dtype=np.int64)
+    for side in scene.sides:
+        with torch.no_grad():
+            hand = posed.in_object_frame(posed.verts(side)).double().numpy()
+        faces = scene.hand_model(side).faces.numpy()
+        shown = evidence.targets.shares[side].numpy() > 0.5
+        inside = scipy.ndimage.binary_erosion(shown, np.ones((1, 3, 3)), iterations=_MARGIN)
+        for t in np.flatnonzero(inside.any(axis=(1, 2))):
+            samples, _ = sample_surface(hand[t], faces, _HAND_SAMPLES)
+            one = slice(t, t + 1)
+            frame = ObjectViews(inside[one], views.K, views.rotations[one], views.centers[one])
+            count += times_empty(frame.shown, frame.poses, verts, samples, depth)
+    return count
+
+
+def _variation(
+    scene: Scene, evidence: Evidence, views: ObjectViews, verts: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """How much brightness around vertices varies from frame to frame, logarithm [V]; NaN where unknown.
+
+    What a frame's light does to all vertices by their normals is left out.
+    """
+    normals = vertex_normals(verts, faces)
+    occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
+    values = np.full((scene.n_frames, len(verts)), np.nan)
+    for t in range(scene.n_frames):
+        seen = seen_in(views, t, verts, normals, occluders, TOLERANCE)
+        rows, columns, _, _ = views.pixels(t, verts[seen])
+        image = evidence.targets.images[t].numpy()
+        values[t, seen] = np.log(image[rows, columns].mean(-1) + _DARK)
+    with warnings.catch_warnings():
+        # Of vertices that never show.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        values -= np.nanmedian(values, axis=0)
+        for t in range(scene.n_frames):
+            seen = np.isfinite(values[t])
+            if seen.any():
+                values[t, seen] -= _light(values[t, seen], normals[seen])
+        values -= np.nanmedian(values, axis=0)
+        spread = np.nanmedian(np.abs(values), axis=0)
+        spread[np.isfinite(values).sum(axis=0) < _LEAST_SHOWN] = np.nan
+        nearest = scipy.spatial.cKDTree(verts).query(verts, k=min(_AROUND, len(verts)))[1]
+        return np.log(np.nanmedian(spread[nearest], axis=1) + 1e-3)
+
+
+def _light(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """The linear function [N] of normals [N, 3] with the least absolute difference from values [N]."""
+    columns = np.column_stack([np.ones(len(normals)), normals])
+    weights = np.ones(len(values))
+    fitted = np.zeros(len(values))
+    for _ in range(3):
+        solution = np.linalg.lstsq(columns * weights[:, None], values * weights, rcond=None)[0]
+        fitted = columns @ solution
+        weights = np.maximum(np.abs(values - fitted), 0.05) ** -0.5
+    return fitted
+
+
+def _vertex_areas(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """A third of the area [V] of each vertex' faces."""
+    return np.bincount(faces.ravel(), np.repeat(face_areas(verts, faces) / 3.0, 3), minlength=len(verts))
+
+
+def _patches(faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The number of the connected patch of each of the chosen vertices."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    index = np.cumsum(chosen) - 1
+    edges = index[edges[chosen[edges].all(axis=1)]]
+    count = int(chosen.sum())
+    graph = scipy.sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

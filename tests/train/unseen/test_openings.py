@@ -1,0 +1,120 @@
+"""Openings: surface before a hand that shows is no surface, and what goes on from it is a picture of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from toy_scenes import CENTER, HALF, cube_scene
+
+from bigs.hand import HandModel
+from bigs.models.scene import ObjectSurface, Scene
+from bigs.raster.settings import RasterSettings
+from bigs.train.loop.step import Evidence
+from bigs.train.loop.targets import Targets
+from bigs.train.plan.config import OpeningConfig
+from bigs.train.unseen.openings import openings, without_openings
+from bigs.types import Side
+
+FRAMES = 8
+# A plate this far before the hands, in the object's frame, and so wide.
+BEFORE, WIDTH = -0.12, 0.4
+
+
+@pytest.fixture
+def scene(both_hands: Mapping[Side, HandModel]) -> Scene:
+    """The cube between its hands; its surface has a plate before them, too, which is not there."""
+    scene = cube_scene(both_hands, frames=FRAMES).requires_grad_(False)
+    cube = trimesh.creation.box((2 * HALF,) * 3).subdivide_to_size(0.01)
+    side = np.linspace(-WIDTH / 2, WIDTH / 2, 81)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    verts = np.column_stack([x, y, np.full(len(x), BEFORE)])
+    corner = (81 * np.arange(80)[:, None] + np.arange(80)).ravel()[:, None]
+    faces = np.concatenate([corner + np.array(turn) for turn in ((0, 81, 1), (1, 81, 82))])
+    scene.replace_surface(
+        ObjectSurface(
+            torch.as_tensor(np.concatenate([cube.vertices, verts]), dtype=torch.float32),
+            torch.as_tensor(np.concatenate([cube.faces, faces + len(cube.vertices)])),
+        )
+    )
+    return scene
+
+
+def on_plate(scene: Scene) -> np.ndarray:
+    return scene.object_surface.verts[:, 2].numpy() == np.float32(BEFORE)
+
+
+def behind_plate(scene: Scene, evidence: Evidence) -> np.ndarray:
+    """Which vertices of the plate fall on a pixel that shows the right hand."""
+    verts = scene.object_surface.verts.numpy() + CENTER
+    pixels = np.floor(verts[:, :2] / verts[:, 2:] * 100.0 + [40.0, 30.0]).astype(int).clip(0, [79, 59])
+    return on_plate(scene) & (evidence.targets.shares["right"][0].numpy()[pixels[:, 1], pixels[:, 0]] > 0.5)
+
+
+def evidence(scene: Scene, *, flicker: float) -> Evidence:
+    """Masks in which the right hand shows and all else is the object, whose brightness flickers."""
+    joints = scene.at(torch.arange(FRAMES)).verts("right").detach()
+    hand = np.zeros((FRAMES, 60, 80), dtype=np.float32)
+    for t, verts in enumerate(joints.numpy()):
+        column, row = np.floor(verts[:, :2] / verts[:, 2:] * 100.0 + [40.0, 30.0]).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < 80) & (row < 60)
+        hand[t, row[inside], column[inside]] = 1.0
+    hand = torch.nn.functional.max_pool2d(torch.as_tensor(hand), 5, 1, 2)
+    noise = torch.rand(FRAMES, 60, 80, 1, generator=torch.Generator().manual_seed(0)) - 0.5
+    images = (0.5 + flicker * noise).expand(-1, -1, -1, 3).contiguous()
+    shares = {"right": hand, "left": torch.zeros_like(hand), "object": 1.0 - hand}
+    targets = Targets(images, shares, torch.zeros_like(hand), scene.K, 80, 60)
+    return Evidence(targets, {}, {}, "surface", RasterSettings())
+
+
+def cube_points(scene: Scene) -> np.ndarray:
+    """Measured points: every vertex of the cube."""
+    return scene.object_surface.verts.numpy()[~on_plate(scene)].astype(np.float64)
+
+
+def test_surface_before_a_hand_that_shows_is_open_and_no_other(scene: Scene) -> None:
+    clip = evidence(scene, flicker=0.0)
+    found = openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig())
+    before_hand = behind_plate(scene, clip)
+    assert before_hand.sum() > 100
+    # The outline counts for less than the middle, and steady surface beside the hand stays.
+    assert found.sum() > 0.3 * before_hand.sum() and not found[~before_hand].any()
+    left = without_openings(scene.object_surface, found)
+    assert len(left.verts) <= len(found) - found.sum() and int(left.faces.max()) == len(left.verts) - 1
+    kept = {tuple(vert) for vert in scene.object_surface.verts[torch.as_tensor(~found)].tolist()}
+    assert {tuple(vert) for vert in left.verts.tolist()} <= kept
+
+
+def test_it_goes_on_where_brightness_varies_but_not_over_measured_points(scene: Scene) -> None:
+    clip = evidence(scene, flicker=0.8)
+    # The cube, which the plate hides, tells nothing of usual brightness; a measured strip of the plate does.
+    verts = scene.object_surface.verts.numpy().astype(np.float64)
+    strip = verts[on_plate(scene) & (verts[:, 0] < -0.1)]
+    still = verts[:, 0] < -0.1
+    clip.targets.images[:, :, :22] = 0.5
+    found = openings(
+        scene, scene.object_surface, clip, np.concatenate([cube_points(scene), strip]), OpeningConfig()
+    )
+    in_view = (np.abs(verts[:, 0]) < 0.1) & (np.abs(verts[:, 1]) < 0.08)
+    beside = on_plate(scene) & in_view & ~behind_plate(scene, clip)
+    assert found[beside].mean() > 0.8
+    assert not found[still].any() and not found[~on_plate(scene)].any()
+
+
+@pytest.mark.parametrize("change", ["frames", "area", "depth", "measured"])
+def test_each_setting_decides(scene: Scene, change: str) -> None:
+    clip = evidence(scene, flicker=0.0)
+    strict = {"frames": FRAMES + 1, "area": 1.0, "depth": 0.3, "measured": 1.0}
+    assert openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig()).any()
+    assert not openings(
+        scene, scene.object_surface, clip, cube_points(scene), OpeningConfig(**{change: strict[change]})
+    ).any()
+
+
+def test_a_hand_that_the_masks_do_not_show_proves_nothing(scene: Scene) -> None:
+    clip = evidence(scene, flicker=0.8)
+    clip.targets.shares["right"].zero_()
+    assert not openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig()).any()
