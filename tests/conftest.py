@@ -12,6 +12,7 @@ import torch
 from command_line import Answer, Run, run_bigs
 from fake_runs import FakeRuns
 from family import Family
+from made_once import MadeOnce
 
 from bigs.cli import main
 from bigs.data.base import Clip
@@ -51,10 +52,19 @@ def both_hands() -> dict[Side, HandModel]:
 
 
 @pytest.fixture(scope="session")
-def tiny_clip(tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
+    """Makes folders that all processes of the session read."""
+    return MadeOnce(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def tiny_clip(made_once: MadeOnce, both_hands: dict[Side, HandModel]) -> Path:
     """12 frames of 120 x 90 of two hands and a bottle, with gt.npz. Read it, never write into it."""
-    folder = tmp_path_factory.mktemp("tiny") / "clip"
-    return make_clip(folder, hand_models=both_hands, frames=12, width=120, height=90, seed=1)
+
+    def make(folder: Path) -> None:
+        make_clip(folder / "clip", hand_models=both_hands, frames=12, width=120, height=90, seed=1)
+
+    return made_once("tiny", make)[0] / "clip"
 
 
 @pytest.fixture(scope="session")
@@ -64,11 +74,11 @@ def tiny(tiny_clip: Path) -> Clip:
 
 
 @pytest.fixture(scope="session")
-def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_clip: Path) -> Run:
+def finished_run(made_once: MadeOnce, tiny_clip: Path) -> Run:
     """`bigs reconstruct` of the tiny clip with the smoke preset. Read it, never write into it."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
-    return Run(folder, command, run_bigs(*command, "--out", folder))
+    folder, answer = made_once("finished", lambda folder: run_bigs(*command, "--out", folder / "run"))
+    return Run(folder / "run", command, Answer(*answer))
 
 
 @pytest.fixture

@@ -65,6 +65,13 @@ def program(value: Any) -> bytes:
     return pickle.dumps(value, 2)[2:-1]
 
 
+def with_keys(keys: list[int]) -> bytes:
+    """`pickle.dumps` of a dictionary with these keys, which is never made: the keys may collide."""
+    entries = [program(key) + b"K\x00" for key in keys]
+    parts = [b"(" + b"".join(entries[i : i + 1000]) + b"u" for i in range(0, len(entries), 1000)]
+    return b"\x80\x02}q\x00" + b"".join(parts) + b"."
+
+
 F8 = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
 DEEP_TUPLE = b"\x80\x02)" + b"\x85" * 100_000
 MIB = 1 << 20
@@ -87,7 +94,7 @@ HOSTILE: dict[str, bytes] = {
     "deep tuple": DEEP_TUPLE + b".",
     "deep tuple as a key": b"\x80\x02}" + DEEP_TUPLE[2:] + b"K\x01s.",
     "deep list": b"\x80\x02" + b"]" * 20_000 + b"a" * 19_999 + b".",
-    "long integers as keys": pickle.dumps({i * ((1 << 61) - 1): 0 for i in range(1, 10_000)}, 2),
+    "long integers as keys": with_keys([i * ((1 << 61) - 1) for i in range(1, 10_000)]),
     "arguments again and again": b"\x80\x02ccollections\nOrderedDict\nq\x00("
     + b"N" * 1000
     + b"tq\x010(h\x00h\x01R"

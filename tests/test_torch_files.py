@@ -8,6 +8,7 @@ import time
 import tracemalloc
 import zipfile
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -109,23 +110,28 @@ def shared_tuple(levels: int) -> Any:
 
 HUGE = pickle.dumps(1 << 40, 2)[2:-1]
 WHOLE = saved(torch.zeros(1))
-HOSTILE = {
-    "shared tuple as a key": changed(
+# Made when a test reads them: some pack hundreds of megabytes.
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "shared tuple as a key": lambda: changed(
         WHOLE, {"data.pkl": b"\x80\x02}" + pickle.dumps(shared_tuple(40), 2)[2:-1] + b"K\x01s."}
     ),
-    "a buffer of any length": changed(
+    "a buffer of any length": lambda: changed(
         WHOLE, {"data.pkl": b"\x80\x02c__builtin__\nbytearray\n" + HUGE + b"\x85R."}
     ),
-    "bytes of any length": changed(WHOLE, {"data.pkl": b"\x80\x02c__builtin__\nbytes\n" + HUGE + b"\x85R."}),
-    "a packed member": changed(WHOLE, {"data/0": bytes(200 * MIB)}, zipfile.ZIP_DEFLATED),
-    "a stride of zero": changed(WHOLE, {"data.pkl": tensor_program(HUGE + b"\x85", b"K\x00\x85")}),
-    "a storage that is cut": changed(WHOLE, {"data.pkl": tensor_program(b"K\x01\x85", b"K\x01\x85", HUGE)}),
-    "a storage that is longer": changed(WHOLE, {"data/0": bytes(8)}),
-    "a tensor beyond its storage": changed(
+    "bytes of any length": lambda: changed(
+        WHOLE, {"data.pkl": b"\x80\x02c__builtin__\nbytes\n" + HUGE + b"\x85R."}
+    ),
+    "a packed member": lambda: changed(WHOLE, {"data/0": bytes(200 * MIB)}, zipfile.ZIP_DEFLATED),
+    "a stride of zero": lambda: changed(WHOLE, {"data.pkl": tensor_program(HUGE + b"\x85", b"K\x00\x85")}),
+    "a storage that is cut": lambda: changed(
+        WHOLE, {"data.pkl": tensor_program(b"K\x01\x85", b"K\x01\x85", HUGE)}
+    ),
+    "a storage that is longer": lambda: changed(WHOLE, {"data/0": bytes(8)}),
+    "a tensor beyond its storage": lambda: changed(
         WHOLE,
         {"data.pkl": tensor_program(b"K\x01K\x01\x86", b"K\x07K\x07\x86").replace(b"tQK\x00", b"tQK\x05")},
     ),
-    "a tensor many times": changed(
+    "a tensor many times": lambda: changed(
         saved(torch.zeros(MIB)),
         {
             "data.pkl": b"\x80\x02("
@@ -133,24 +139,25 @@ HOSTILE = {
             + b"t."
         },
     ),
-    "code": saved({"a": print}),
-    "another order": changed(WHOLE, {"byteorder": b"big"}),
-    "no program": changed(WHOLE, {}).replace(b"data.pkl", b"nothing!"),
-    "old, whose length is another": saved(torch.zeros(1), _use_new_zipfile_serialization=False)[:-2],
-    "old, whose program is deep": saved(0, _use_new_zipfile_serialization=False)[:-14]
-    + b"\x80\x02"
-    + b"]" * 10**5,
-    "text": b"hello",
-    "nothing": b"",
+    "code": lambda: saved({"a": print}),
+    "another order": lambda: changed(WHOLE, {"byteorder": b"big"}),
+    "no program": lambda: changed(WHOLE, {}).replace(b"data.pkl", b"nothing!"),
+    "old, whose length is another": lambda: saved(torch.zeros(1), _use_new_zipfile_serialization=False)[:-2],
+    "old, whose program is deep": lambda: (
+        saved(0, _use_new_zipfile_serialization=False)[:-14] + b"\x80\x02" + b"]" * 10**5
+    ),
+    "text": lambda: b"hello",
+    "nothing": lambda: b"",
 }
 
 
 @pytest.mark.parametrize("what", HOSTILE)
 def test_little_that_asks_for_much(what: str) -> None:
+    content = HOSTILE[what]()
     began = time.process_time()
     tracemalloc.start()
     with pytest.raises(InputError, match=r"^file\.pt: expected .*found") as caught:
-        read(HOSTILE[what])
+        read(content)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 400
@@ -159,7 +166,7 @@ def test_little_that_asks_for_much(what: str) -> None:
 
 def test_every_reader_refuses_them(tmp_path: Path) -> None:
     """A prediction, a submission's member and the weights of a network."""
-    content = HOSTILE["shared tuple as a key"]
+    content = HOSTILE["shared tuple as a key"]()
     for reader in (load_challenge, lambda path: load_weights(path, "VGG-16")):
         path = tmp_path / "file.pt"
         path.write_bytes(content)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -11,17 +10,7 @@ from scipy.spatial import cKDTree
 
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.data.formats.hold import load_hold
-from bigs.data.ground_truth import load_ground_truth
-from bigs.data.synthetic import make_clip
-from bigs.hand import HandModel
-from bigs.types import MASK_VALUES, HandObjectTrajectory, Side
-
-
-def bottle_clip(folder: Path, hands: dict[Side, HandModel]) -> tuple[Clip, HandObjectTrajectory]:
-    """A whole turn of a bottle in 36 small frames, and the truth."""
-    path = make_clip(folder, hand_models=hands, frames=36, width=240, height=180, seed=2)
-    return load_hold(path), load_ground_truth(path)
+from bigs.types import MASK_VALUES, HandObjectTrajectory
 
 
 def limited_view(clip: Clip, truth: HandObjectTrajectory, frames: range) -> Clip:

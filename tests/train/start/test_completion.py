@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from limited_view import bottle_clip, limited_view
+from limited_view import limited_view
 
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
@@ -29,15 +29,8 @@ INITIAL = InitialConfig(surface_resolution=56)
 
 
 @pytest.fixture(scope="module")
-def bottle(
-    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
-) -> tuple[Clip, HandObjectTrajectory]:
-    return bottle_clip(tmp_path_factory.mktemp("bottle") / "clip", both_hands)
-
-
-@pytest.fixture(scope="module")
-def one_side(bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, ObjectHull, ObjectStart]:
-    clip = limited_view(*bottle, range(12))
+def one_side(whole_bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, ObjectHull, ObjectStart]:
+    clip = limited_view(*whole_bottle, range(12))
     start = smooth_object(object_in_camera(clip, INITIAL), 2.0)
     return clip, find_object_hull(clip, nothing_hides(clip), start, INITIAL), start
 
@@ -53,14 +46,14 @@ def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
 
 @pytest.mark.slow
 def test_the_unseen_side_comes_nearer_to_the_truth(
-    one_side: tuple[Clip, ObjectHull, ObjectStart], bottle: tuple[Clip, HandObjectTrajectory]
+    one_side: tuple[Clip, ObjectHull, ObjectStart], whole_bottle: tuple[Clip, HandObjectTrajectory]
 ) -> None:
     _, hull, start = one_side
     found = complete(hull, start, INITIAL, CompletionConfig())
     assert found.seen < 0.7
     assert found.symmetries and len(found.points) == len(found.colors) > 100
-    before = score(hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach), bottle[1])
-    after = score(found.surface, bottle[1])
+    before = score(hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach), whole_bottle[1])
+    after = score(found.surface, whole_bottle[1])
     assert after.chamfer.squared < 0.8 * before.chamfer.squared
     assert after.f5 > before.f5 and after.f10 >= before.f10
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from limited_view import bottle_clip, limited_view
+from limited_view import limited_view
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
@@ -36,12 +36,9 @@ PLAN = replace(
 
 
 @pytest.fixture(scope="module")
-def bottle(
-    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
-) -> tuple[Clip, HandObjectTrajectory]:
+def bottle(whole_bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, HandObjectTrajectory]:
     """A third of a turn of a bottle, and the truth."""
-    clip, truth = bottle_clip(tmp_path_factory.mktemp("bottle") / "clip", both_hands)
-    return limited_view(clip, truth, range(12)), truth
+    return limited_view(*whole_bottle, range(12)), whole_bottle[1]
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from limited_view import bottle_clip, limited_view
+from limited_view import limited_view
 
+from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.fit import fit
@@ -19,7 +19,7 @@ from bigs.train.plan.config import PriorConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.unseen.stages import OBSERVED_AT
 from bigs.train.unseen.visibility import hands_shown
-from bigs.types import Side
+from bigs.types import HandObjectTrajectory, Side
 
 PLAN = replace(
     SMOKE, prior=PriorConfig("off"), object=replace(SMOKE.object, n_gaussians=600), stages=SMOKE.stages[:1]
@@ -28,20 +28,18 @@ PLAN = replace(
 
 @pytest.fixture(scope="module")
 def posed(
-    tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]
+    whole_bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
 ) -> tuple[Scene, Evidence]:
-    folder: Path = tmp_path_factory.mktemp("bottle")
-    whole, truth = bottle_clip(folder / "clip", both_hands)
-    clip = limited_view(whole, truth, range(6))
+    clip = limited_view(*whole_bottle, range(6))
     scene, _ = fit(clip, both_hands, PLAN)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
     return scene, EvidenceSource(clip, nothing, scene, PLAN, None).evidence(OBSERVED_AT)
 
 
 @pytest.fixture(scope="module")
-def half_hidden(tmp_path_factory: pytest.TempPathFactory, both_hands: dict[Side, HandModel]) -> Scene:
-    whole, truth = bottle_clip(tmp_path_factory.mktemp("split") / "clip", both_hands)
-    return fit(limited_view(whole, truth, range(6)), both_hands, replace(PLAN, stages=(SplitStage(),)))[0]
+def half_hidden(whole_bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]) -> Scene:
+    clip = limited_view(*whole_bottle, range(6))
+    return fit(clip, both_hands, replace(PLAN, stages=(SplitStage(),)))[0]
 
 
 def masked(evidence: Evidence, share: float) -> Evidence:
