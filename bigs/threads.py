@@ -12,10 +12,10 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """`function` of each item, in their order, on as many threads as torch has.
+def side_by_side(function: Callable[[T], R], items: Iterable[T], threads: int | None = None) -> list[R]:
+    """`function` of each item, in their order, on some threads; None takes as many as torch has.
 
     It pays where most of the work is done without the interpreter: decoding, filtering, searching.
     """
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with ThreadPoolExecutor(threads or torch.get_num_threads()) as pool:
         return list(pool.map(function, items))

@@ -93,6 +93,15 @@ def evaluate(
     return {key: scores[key] for key in METRICS if key in scores}
 
 
+def check_comparable(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> None:
+    """Raise what `evaluate` raises where it refuses the two, before it takes its time.
+
+    Raises:
+        InputError: see `evaluate`.
+    """
+    _matched(pred, gt)
+
+
 def remarks(pred: HandObjectTrajectory, gt: HandObjectTrajectory) -> dict[str, str]:
     """Why scores of `evaluate` are missing, or the number of frames they cover, by key. Scores that need what
     neither side has, and scores over all frames, have no remark.

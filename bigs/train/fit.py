@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
-import bigs
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.guidance.denoiser import Denoiser
@@ -21,12 +19,14 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.motion.tracker import TrackedMotion
+from bigs.train.digest import run_digest
 from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
 from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageProgress, StageState, run_stage
 from bigs.train.loop.stopwatch import Stopwatch
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
@@ -110,12 +110,16 @@ def fit(
     torch.manual_seed(config.seed)
     watch = watch or Stopwatch("start values")
     watch.begin("start values")
-    unknown = unknown_occluders(clip)
+    # Few of the tracker's operations are parallel, so there is a core to spare beside it.
+    occluders = ThreadPoolExecutor(1).submit(unknown_occluders, clip)
     motion = None
     if config.stages and isinstance(config.stages[0], ObjectMotionStage):
         watch.begin(config.stages[0].name)
         motion = _object_motion(clip, config, config.stages[0], checkpoints, report, listen)
         watch.begin("start values")
+    unknown = occluders.result()
+    targets = TargetSource(clip, unknown)
+    targets.make_ahead(_image_sizes(config.stages))
     start = build_scene(
         clip,
         unknown,
@@ -140,7 +144,7 @@ def fit(
         report = FitReport(**position.report)
         report.before = sum(report.seconds.values())
         watch.add(report.seconds)
-    sources = EvidenceSource(clip, unknown, scene, config, perceptual, denoiser)
+    sources = EvidenceSource(targets, scene, config, perceptual, denoiser)
 
     def keep(index: int, state: StageState | None) -> None:
         """Save the state of the running stage, or of the one that has just ended."""
@@ -169,6 +173,7 @@ def fit(
             continue
         listen({"event": "stage", "stage": stage.name, "index": index, "stages": len(config.stages)})
         watch.begin(stage.name)
+        targets.make_ahead(_image_sizes(config.stages[index:]))
         continues = position.resume if position and index == first else None
         if isinstance(stage, ScaleSearchStage):
             size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
@@ -211,6 +216,19 @@ def fit(
     report.facts |= finish_mesh(scene, start, sources, config, report.completed)
     report.seconds = watch.read()
     return scene, report
+
+
+def _image_sizes(stages: Sequence[Stage]) -> list[int]:
+    """The sizes at which stages look at the clip's images, in their order."""
+    sizes = []
+    for stage in stages:
+        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage):
+            sizes.append(stage.image_size)
+        elif not isinstance(stage, ObjectMotionStage) and not (
+            isinstance(stage, SplitStage) and not stage.hands
+        ):
+            sizes.append(OBSERVED_AT.image_size)
+    return sizes
 
 
 def _object_motion(
@@ -314,28 +332,3 @@ def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
     if subjects == {"object"} and scene.object_splats is None:
         return "the clip has no object"
     return None
-
-
-def run_digest(
-    clip: Clip,
-    scene: Scene,
-    config: RunConfig,
-    perceptual: VggWeights | None,
-    denoiser: Denoiser | None,
-) -> str:
-    """Identifies what a checkpoint belongs to: version, configuration, images, masks and start values."""
-    # The content of a network counts, not its path.
-    prior = replace(config.prior, weights="", controlnet="", token="", edge_weights="")
-    config = replace(config, perceptual_weights=(), prior=prior)
-    origin = None if denoiser is None else denoiser.fingerprint
-    text = json.dumps(
-        [bigs.__version__, clip.name, list(clip.frame_names), asdict(config), origin], sort_keys=True
-    )
-    digest = hashlib.sha256(text.encode())
-    for path in (*clip.image_paths, *clip.mask_paths):
-        digest.update(path.read_bytes())
-    # Parameters hold the fields' random start; buffers hold poses, surface and the hand model.
-    network = () if perceptual is None else perceptual.tensors()
-    for values in (*scene.parameters(), *scene.buffers(), *network):
-        digest.update(values.detach().numpy().tobytes())
-    return digest.hexdigest()[:16]

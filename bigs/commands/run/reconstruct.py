@@ -33,7 +33,7 @@ from bigs.hand import load_hand_models
 from bigs.losses.perceptual_file import load_perceptual_weights
 from bigs.metrics.headlines import headline_meanings, headline_table
 from bigs.metrics.picture import ALL_METRICS
-from bigs.metrics.report import comparison_table, evaluate, per_frame, remarks
+from bigs.metrics.report import check_comparable, comparison_table, evaluate, per_frame, remarks
 from bigs.models.playback import record
 from bigs.train.check_plan import check_plan
 from bigs.train.fit import FitReport, Observer, fit
@@ -105,10 +105,13 @@ def reconstruct(
     if begun and (out / CONFIG).exists():
         check_same_options(out, config, origin)
     baseline = initial_trajectory(clip, hand_models)
-    scores = {} if truth is None else {"initial": evaluate(baseline, truth)}
+    if truth is not None:
+        check_comparable(baseline, truth)
 
     out.mkdir(parents=True, exist_ok=True)
-    with only_writer(out):
+    with only_writer(out), ThreadPoolExecutor(1) as beside:
+        # The start values leave a core to spare for it.
+        initial = None if truth is None else beside.submit(evaluate, baseline, truth)
         remove_parts(out)
         # A checkpoint of another configuration is refused; without one, compare the options.
         if not begun:
@@ -147,18 +150,18 @@ def reconstruct(
             watch.begin("scores")
             listen({"event": "note", "stage": "outputs", "text": "scoring, drawing pictures"})
             # Neither needs the other, nor much of the interpreter.
-            with ThreadPoolExecutor(1) as beside:
-                drawing = beside.submit(draw_pictures, out, clip, playback)
-                frames = frame_scores(clip, playback)
-                found = playback.trajectory()
-                of_frames = {} if truth is None else per_frame(found, truth)
-                scores["result"] = means(frames)
-                if truth is not None:
-                    scores["result"] = evaluate(found, truth, of_frames) | scores["result"]
-                for line in report.skipped:
-                    log_and_listen({"event": "skipped", "text": line})
-                write_json(out / METRICS, scores)
-                watch.begin("pictures")
+            drawing = beside.submit(draw_pictures, out, clip, playback)
+            frames = frame_scores(clip, playback)
+            found = playback.trajectory()
+            of_frames = {} if truth is None else per_frame(found, truth)
+            scores = {} if initial is None else {"initial": initial.result()}
+            scores["result"] = means(frames)
+            if truth is not None:
+                scores["result"] = evaluate(found, truth, of_frames) | scores["result"]
+            for line in report.skipped:
+                log_and_listen({"event": "skipped", "text": line})
+            write_json(out / METRICS, scores)
+            watch.begin("pictures")
         drawn = drawing.result()
         told = partly(frames)
         if truth is not None:

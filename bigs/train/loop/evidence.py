@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bigs.data.base import Clip
 from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand
@@ -17,7 +15,8 @@ from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
 from bigs.train.loop.step import Evidence, Selection, Step
-from bigs.train.loop.targets import Targets, crop_box, load_targets
+from bigs.train.loop.target_source import TargetSource
+from bigs.train.loop.targets import Targets
 from bigs.train.loop.terms import labels
 from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage
 from bigs.train.start.initial import touching_frames
@@ -28,8 +27,6 @@ SILHOUETTE_SIGMA = 0.0022
 # Centres are moved inwards by this many standard deviations of a Gaussian in the image. Opaque neighbours
 # overlap, so their common alpha falls to one half well outside the centres.
 INSET = 2.0
-# Stages return to an earlier resolution; of the others this many bytes are kept, since memory is scarce.
-_KEPT = 160 * 2**20
 
 
 class EvidenceSource:
@@ -37,28 +34,26 @@ class EvidenceSource:
 
     def __init__(
         self,
-        clip: Clip,
-        unknown: np.ndarray,
+        targets: TargetSource,
         scene: Scene,
         config: RunConfig,
         perceptual: VggWeights | None,
         denoiser: Denoiser | None = None,
     ) -> None:
-        self.clip = clip
-        self.unknown = unknown
+        self.clip = targets.clip
+        self.unknown = targets.unknown
+        self.targets = targets
         self.scene = scene
         self.config = config
         self.perceptual = perceptual
         self.denoiser = denoiser
-        self.box = crop_box(clip)
         # Where the masks of hand and object meet.
         self.meeting: dict[Side, Tensor] = {
-            side: torch.as_tensor(touching_frames(clip, side), dtype=torch.float32)
+            side: torch.as_tensor(touching_frames(self.clip, side), dtype=torch.float32)
             if scene.object_splats is not None
-            else torch.zeros(len(clip))
+            else torch.zeros(len(self.clip))
             for side in scene.sides
         }
-        self._targets: dict[int, Targets] = {}
 
     def touching(self) -> dict[Side, Tensor]:
         """For each hand [T] 1 where it touches the object, as far as is known by now.
@@ -80,7 +75,7 @@ class EvidenceSource:
 
     def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
-        targets = self.targets(stage.image_size)
+        targets = self.targets.at(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(
             targets,
@@ -119,24 +114,6 @@ class EvidenceSource:
             return torch.where(shown, squares / area.clamp_min(0.25 * area.median()), torch.nan)
 
         return ask
-
-    def targets(self, size: int) -> Targets:
-        """Images and masks, shrunk as a frame to a long side of `size` pixels; 0 keeps the clip's size."""
-        found = self._targets.pop(size, None)
-        # Before new ones take their room.
-        self._forget(_KEPT)
-        if found is None:
-            long_side = max(self.clip.width, self.clip.height)
-            scale = min(1.0, size / long_side) if size else 1.0
-            found = load_targets(self.clip, self.unknown, scale, self.box)
-        self._targets[size] = found
-        return found
-
-    def _forget(self, most: int) -> None:
-        """Let go of targets until what is left has at most this many bytes, the longest unused first."""
-        for size in list(self._targets):
-            if sum(targets.size() for targets in self._targets.values()) > most:
-                del self._targets[size]
 
     def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
         """A hand whose outline lies right at this resolution.

@@ -66,14 +66,21 @@ def crop_box(clip: Clip, margin: float = 0.06) -> tuple[int, int, int, int]:
     )
 
 
-def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, int, int, int]) -> Targets:
+def load_targets(
+    clip: Clip,
+    unknown: np.ndarray,
+    scale: float,
+    box: tuple[int, int, int, int],
+    threads: int | None = None,
+) -> Targets:
     """Read the clip's frames inside `box` and shrink them by area to `scale` times their size.
 
-    `unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size.
+    `unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size. `threads` is as in
+    `side_by_side`.
     """
     x0, y0, x1, y1 = box
     width, height = (max(1, round(scale * n)) for n in (x1 - x0, y1 - y0))
-    labels = np.stack(side_by_side(lambda t: clip.mask(t)[y0:y1, x0:x1], range(len(clip))))
+    labels = np.stack(side_by_side(lambda t: clip.mask(t)[y0:y1, x0:x1], range(len(clip)), threads))
 
     # Frame by frame: a whole clip in floats at full size would be the run's largest array.
     def shrunk(t: int) -> Tensor:
@@ -82,9 +89,11 @@ def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, 
             whole.float() / 255.0, (height, width), mode="bilinear", antialias=True
         )
 
-    small = torch.cat(side_by_side(shrunk, range(len(clip))))
+    small = torch.cat(side_by_side(shrunk, range(len(clip)), threads))
     present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
-    shares = {entity: share_per_pixel(labels == MASK_VALUES[entity], height, width) for entity in present}
+    shares = {
+        entity: share_per_pixel(labels == MASK_VALUES[entity], height, width, threads) for entity in present
+    }
     # Pixel centres lie at +0.5, so image coordinates scale without an offset.
     sx, sy = width / (x1 - x0), height / (y1 - y0)
     K = clip.K.copy()
@@ -95,7 +104,7 @@ def load_targets(clip: Clip, unknown: np.ndarray, scale: float, box: tuple[int, 
     return Targets(
         small.permute(0, 2, 3, 1).contiguous(),
         shares,
-        share_per_pixel(unknown[:, y0:y1, x0:x1], height, width),
+        share_per_pixel(unknown[:, y0:y1, x0:x1], height, width, threads),
         torch.as_tensor(K, dtype=torch.float32),
         width,
         height,

@@ -153,11 +153,14 @@ def _color_counts(colors: np.ndarray, frames: np.ndarray) -> np.ndarray:
     return scipy.ndimage.gaussian_filter(counts, 1.0, mode="constant")
 
 
-def share_per_pixel(masks: np.ndarray, height: int, width: int) -> torch.Tensor:
-    """Masks [T, H, W] (bool) as shares [T, height, width] of smaller pixels."""
+def share_per_pixel(masks: np.ndarray, height: int, width: int, threads: int | None = None) -> torch.Tensor:
+    """Masks [T, H, W] (bool) as shares [T, height, width] of smaller pixels.
+
+    `threads` is as in `side_by_side`.
+    """
 
     def share(mask: np.ndarray) -> torch.Tensor:
         whole = torch.from_numpy(mask)[None, None].float()
         return torch.nn.functional.interpolate(whole, (height, width), mode="bilinear", antialias=True)
 
-    return torch.cat(side_by_side(share, masks))[:, 0]
+    return torch.cat(side_by_side(share, masks, threads))[:, 0]

@@ -27,6 +27,7 @@ from bigs.train.loop.checkpoint import FILE_NAME
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageProgress, StageState, choose_frames, run_stage
 from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.loop.terms import TERMS
 from bigs.train.plan.config import OptimizeStage, RunConfig, SplitStage
 from bigs.train.plan.config_file import from_plain, to_plain, with_changes
@@ -169,7 +170,7 @@ def test_too_few_gaussians_become_more_and_show_the_clip_better(
     for densify in (None, FEW):
         config = object_plan(40, 100, densify)
         scene, report = fit(tiny, both_hands, config)
-        source = EvidenceSource(tiny, unknown_occluders(tiny), scene, config, None)
+        source = EvidenceSource(TargetSource(tiny, unknown_occluders(tiny)), scene, config, None)
         evidence = source.evidence(config.stages[0])
         error = image_error(scene, evidence, ("object",), torch.arange(len(tiny)))
         found[densify] = count(scene), error, report.facts.get("object Gaussians")

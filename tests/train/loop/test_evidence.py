@@ -15,6 +15,7 @@ from bigs.models.hand_splats import pose_hand
 from bigs.models.scene import Scene
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Selection, Step
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.presets import FAST, SMOKE
 from bigs.train.start.build import build_scene
 from bigs.types import Side
@@ -25,7 +26,7 @@ def source(tiny: Clip, both_hands: dict[Side, HandModel]) -> EvidenceSource:
     torch.manual_seed(0)
     unknown = np.zeros((len(tiny), tiny.height, tiny.width), dtype=bool)
     scene = build_scene(tiny, unknown, both_hands, SMOKE.initial, SMOKE.hand, SMOKE.object, False).scene
-    return EvidenceSource(tiny, unknown, scene, SMOKE, None)
+    return EvidenceSource(TargetSource(tiny, unknown), scene, SMOKE, None)
 
 
 def test_only_grasps_count_as_touching_once_they_are_known(source: EvidenceSource) -> None:
@@ -92,16 +93,3 @@ def best_depth(scene: Scene, source: EvidenceSource, size: int) -> float:
 def test_a_silhouette_is_as_large_as_the_hand(source: EvidenceSource) -> None:
     """An outline that is off by a per cent is paid for with a per cent of depth: most of a centimetre."""
     assert abs(best_depth(source.scene, source, 0) - 1.0) < 0.011
-
-
-def test_targets_are_kept_while_there_is_room(
-    source: EvidenceSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, second = source.targets(40), source.targets(20)
-    assert source.targets(40) is first
-    assert source.targets(20) is second
-    # Room for the smaller ones alone: the larger go when they are not looked at.
-    monkeypatch.setattr("bigs.train.loop.evidence._KEPT", second.size())
-    source.targets(30)
-    assert source.targets(20) is second
-    assert source.targets(40) is not first

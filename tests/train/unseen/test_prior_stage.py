@@ -22,6 +22,7 @@ from bigs.models.scene import Scene
 from bigs.train.fit import FitReport, fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Selection, Step
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import GuidanceStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import PRESETS, SMOKE
 from bigs.train.resolve import resolve
@@ -76,7 +77,7 @@ def test_what_shows_in_a_frame_stays(
     after, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), wild)), prior)
     assert "moved" in report.facts["prior"]
     nothing = np.zeros((5, one_side.height, one_side.width), dtype=bool)
-    evidence = EvidenceSource(one_side, nothing, before, PLAN, None).evidence(
+    evidence = EvidenceSource(TargetSource(one_side, nothing), before, PLAN, None).evidence(
         replace(SMOKE.stages[0], image_size=240)
     )
     shown, now = (weights_in_pictures(scene, evidence) for scene in (before, after))
@@ -108,7 +109,7 @@ def test_the_clips_frames_hold_what_they_show(
     every = torch.arange(5)
     start = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)[0]
     unknown = np.zeros((5, one_side.height, one_side.width), dtype=bool)
-    evidence = EvidenceSource(one_side, unknown, start, PLAN, None).evidence(
+    evidence = EvidenceSource(TargetSource(one_side, unknown), start, PLAN, None).evidence(
         replace(SMOKE.stages[0], image_size=0)
     )
     step = Step(start, evidence, start.canonical(("object",)), Selection(every, ("object",), labels=False))
@@ -129,7 +130,7 @@ def test_an_object_that_leaves_its_mask_is_measured(
 ) -> None:
     scene, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
     unknown = np.zeros((5, one_side.height, one_side.width), dtype=bool)
-    evidence = EvidenceSource(one_side, unknown, scene, PLAN, None).evidence(
+    evidence = EvidenceSource(TargetSource(one_side, unknown), scene, PLAN, None).evidence(
         replace(SMOKE.stages[0], image_size=0)
     )
     every = torch.arange(5)

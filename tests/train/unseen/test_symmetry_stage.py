@@ -18,6 +18,7 @@ from bigs.metrics.shape import ShapeScore
 from bigs.models.scene import Scene
 from bigs.train.fit import FitReport, fit
 from bigs.train.loop.evidence import EvidenceSource
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import CompletionStage, PriorConfig, RunConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
@@ -106,7 +107,9 @@ def test_what_is_added_shows_in_no_frame(
     bottle: tuple[Clip, HandObjectTrajectory],
 ) -> None:
     clip = bottle[0]
-    sources = EvidenceSource(clip, np.zeros((len(clip), 180, 240), dtype=bool), completed[0], PLAN, None)
+    sources = EvidenceSource(
+        TargetSource(clip, np.zeros((len(clip), 180, 240), dtype=bool)), completed[0], PLAN, None
+    )
     evidence = sources.evidence(replace(SMOKE.stages[0], image_size=240))
     known = plain[0].object_splats.base_means
     new = ~(completed[0].object_splats.base_means[:, None] == known[None]).all(-1).any(1)

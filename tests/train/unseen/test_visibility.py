@@ -15,6 +15,7 @@ from bigs.models.scene import Scene
 from bigs.train.fit import fit
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Evidence
+from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import PriorConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.unseen.stages import OBSERVED_AT
@@ -33,7 +34,7 @@ def posed(
     clip = limited_view(*whole_bottle, range(6))
     scene, _ = fit(clip, both_hands, PLAN)
     nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
-    return scene, EvidenceSource(clip, nothing, scene, PLAN, None).evidence(OBSERVED_AT)
+    return scene, EvidenceSource(TargetSource(clip, nothing), scene, PLAN, None).evidence(OBSERVED_AT)
 
 
 @pytest.fixture(scope="module")
