@@ -194,8 +194,10 @@ class OpeningConfig:
     # A hand that shows further than this behind the surface is seen through it, metres: more than a hand's
     # depth is usually wrong by.
     depth: float = 0.012
-    # Frames that must show it, and the least area of what they prove to be open, square metres.
+    # Frames that must show it, which must be this share of all, and the least area of what they prove to be
+    # open, square metres.
     frames: int = 5
+    share: float = 0.08
     area: float = 1e-4
     # Surface nearer than this to a measured point is there, metres.
     measured: float = 0.004

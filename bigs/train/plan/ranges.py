@@ -97,7 +97,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "min_transmittance": Range(0.0, 0.999),
     },
     CompletionConfig: {"enough": _SHARE},
-    OpeningConfig: {"frames": _COUNT},
+    OpeningConfig: {"frames": _COUNT, "share": _SHARE},
     OptimizeStage: {"image_size": _PIXELS, "final_lr": _SHARE, "adam_betas": Range(0.0, 0.9999999)},
     ScaleSearchStage: {
         "span": Range(0.0, 0.999),

@@ -49,7 +49,8 @@ def openings(
     verts, faces = surface.verts.double().numpy(), surface.faces.numpy()
     views = object_views(scene, evidence)
     unmeasured = scipy.spatial.cKDTree(measured).query(verts)[0] > config.measured
-    proven = unmeasured & (_hands_behind(scene, evidence, views, verts, config.depth) >= config.frames)
+    least = max(config.frames, config.share * scene.n_frames)
+    proven = unmeasured & (_hands_behind(scene, evidence, views, verts, config.depth) >= least)
     area = _vertex_areas(verts, faces)
     if area[proven].sum() < config.area:
         return np.zeros(len(verts), dtype=bool)

@@ -104,10 +104,10 @@ def test_it_goes_on_where_brightness_varies_but_not_over_measured_points(scene: 
     assert not found[still].any() and not found[~on_plate(scene)].any()
 
 
-@pytest.mark.parametrize("change", ["frames", "area", "depth", "measured"])
+@pytest.mark.parametrize("change", ["frames", "share", "area", "depth", "measured"])
 def test_each_setting_decides(scene: Scene, change: str) -> None:
     clip = evidence(scene, flicker=0.0)
-    strict = {"frames": FRAMES + 1, "area": 1.0, "depth": 0.3, "measured": 1.0}
+    strict = {"frames": FRAMES + 1, "share": 1.1, "area": 1.0, "depth": 0.3, "measured": 1.0}
     assert openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig()).any()
     assert not openings(
         scene, scene.object_surface, clip, cube_points(scene), OpeningConfig(**{change: strict[change]})
