@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
 from bigs.checks import InputError, check_shape
@@ -145,15 +144,19 @@ def _gaussian_kernel(window: int, sigma: float, like: torch.Tensor) -> torch.Ten
 def _blur(planes: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     """Blur each plane of [B, C, H, W] alone, first along columns and then along rows, zeros outside.
 
-    All planes as channels of one depthwise convolution: on a CPU this is an order of magnitude faster than
-    planes as a batch.
+    A sum of shifted planes: on a CPU this takes a third of the time of a convolution with so few channels.
     """
-    channels, half = planes.shape[0] * planes.shape[1], kernel.shape[0] // 2
-    column = kernel.view(1, 1, -1, 1).expand(channels, 1, -1, 1)
-    row = kernel.view(1, 1, 1, -1).expand(channels, 1, 1, -1)
-    blurred = planes.reshape(1, channels, *planes.shape[2:])
-    blurred = F.conv2d(blurred, column, padding=(half, 0), groups=channels)
-    return F.conv2d(blurred, row, padding=(0, half), groups=channels).view(planes.shape)
+    weights = kernel.tolist()
+    half = len(weights) // 2
+    for axis in (2, 3):
+        length = planes.shape[axis]
+        blurred = planes * weights[half]
+        for shift in range(1, min(half, length - 1) + 1):
+            kept, weight = length - shift, weights[half - shift]
+            blurred.narrow(axis, shift, kept).add_(planes.narrow(axis, 0, kept), alpha=weight)
+            blurred.narrow(axis, 0, kept).add_(planes.narrow(axis, shift, kept), alpha=weight)
+        planes = blurred
+    return planes
 
 
 def _masked_means(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 import bigs
@@ -43,6 +44,7 @@ from bigs.train.plan.config import RunConfig
 from bigs.train.plan.config_file import save_config
 from bigs.train.resolve import resolve
 from bigs.train.start.initial import initial_trajectory
+from bigs.types import HandObjectTrajectory
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def reconstruct(
         check_comparable(baseline, truth)
 
     out.mkdir(parents=True, exist_ok=True)
-    with only_writer(out), ThreadPoolExecutor(1) as beside:
+    with only_writer(out), ThreadPoolExecutor(2) as beside:
         # The start values leave a core to spare for it.
         initial = None if truth is None else beside.submit(evaluate, baseline, truth)
         remove_parts(out)
@@ -149,15 +151,14 @@ def reconstruct(
             write_outputs(out, playback)
             watch.begin("scores")
             listen({"event": "note", "stage": "outputs", "text": "scoring, drawing pictures"})
-            # Neither needs the other, nor much of the interpreter.
+            # None needs another, nor much of the interpreter.
             drawing = beside.submit(draw_pictures, out, clip, playback)
-            frames = frame_scores(clip, playback)
             found = playback.trajectory()
-            of_frames = {} if truth is None else per_frame(found, truth)
+            judging = None if truth is None else beside.submit(_judge, found, truth)
+            frames = frame_scores(clip, playback)
+            of_frames, against_truth = ({}, {}) if judging is None else judging.result()
             scores = {} if initial is None else {"initial": initial.result()}
-            scores["result"] = means(frames)
-            if truth is not None:
-                scores["result"] = evaluate(found, truth, of_frames) | scores["result"]
+            scores["result"] = against_truth | means(frames)
             for line in report.skipped:
                 log_and_listen({"event": "skipped", "text": line})
             write_json(out / METRICS, scores)
@@ -181,6 +182,14 @@ def reconstruct(
             sum(report.seconds.values()),
             tuple(headline_meanings(scores, told)),
         )
+
+
+def _judge(
+    found: HandObjectTrajectory, truth: HandObjectTrajectory
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Scores of every frame, and those of the clip."""
+    of_frames = per_frame(found, truth)
+    return of_frames, evaluate(found, truth, of_frames)
 
 
 def run_origin(clip_path: Path, hand_model: Path | None) -> dict[str, str | None]:
