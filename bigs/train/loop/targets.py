@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bigs.data.base import Clip
 from bigs.threads import side_by_side
-from bigs.train.start.background import share_per_pixel
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 
@@ -80,20 +79,21 @@ def load_targets(
     """
     x0, y0, x1, y1 = box
     width, height = (max(1, round(scale * n)) for n in (x1 - x0, y1 - y0))
-    labels = np.stack(side_by_side(lambda t: clip.mask(t)[y0:y1, x0:x1], range(len(clip)), threads))
-
-    # Frame by frame: a whole clip in floats at full size would be the run's largest array.
-    def shrunk(t: int) -> Tensor:
-        whole = torch.from_numpy(clip.image(t)[y0:y1, x0:x1]).permute(2, 0, 1)[None]
-        return torch.nn.functional.interpolate(
-            whole.float() / 255.0, (height, width), mode="bilinear", antialias=True
-        )
-
-    small = torch.cat(side_by_side(shrunk, range(len(clip)), threads))
+    images = torch.empty(len(clip), height, width, 3)
     present = [entity for entity in ENTITIES if entity in clip.hands or (entity == "object" and clip.object)]
-    shares = {
-        entity: share_per_pixel(labels == MASK_VALUES[entity], height, width, threads) for entity in present
-    }
+    shares = {entity: torch.empty(len(clip), height, width) for entity in present}
+    covered = torch.empty(len(clip), height, width)
+
+    # Frame by frame into its place: a whole clip at full size, or twice, would be the run's largest array.
+    def fill(t: int) -> None:
+        image = torch.from_numpy(clip.image(t)[y0:y1, x0:x1]).permute(2, 0, 1)[None]
+        images[t] = _shrunk(image.float() / 255.0, height, width)[0].permute(1, 2, 0)
+        labels = clip.mask(t)[y0:y1, x0:x1]
+        for entity in present:
+            shares[entity][t] = share_per_pixel(labels == MASK_VALUES[entity], height, width)
+        covered[t] = share_per_pixel(unknown[t, y0:y1, x0:x1], height, width)
+
+    side_by_side(fill, range(len(clip)), threads)
     # Pixel centres lie at +0.5, so image coordinates scale without an offset.
     sx, sy = width / (x1 - x0), height / (y1 - y0)
     K = clip.K.copy()
@@ -102,10 +102,20 @@ def load_targets(
     K[0, 2] -= sx * x0
     K[1, 2] -= sy * y0
     return Targets(
-        small.permute(0, 2, 3, 1).contiguous(),
+        images,
         shares,
-        share_per_pixel(unknown[:, y0:y1, x0:x1], height, width, threads),
+        covered,
         torch.as_tensor(K, dtype=torch.float32),
         width,
         height,
     )
+
+
+def share_per_pixel(mask: np.ndarray, height: int, width: int) -> Tensor:
+    """A mask [H, W] (bool) as shares [height, width] of smaller pixels."""
+    return _shrunk(torch.from_numpy(mask)[None, None].float(), height, width)[0, 0]
+
+
+def _shrunk(picture: Tensor, height: int, width: int) -> Tensor:
+    """A picture [1, C, H, W] as means over the pixels of a smaller one [1, C, height, width]."""
+    return torch.nn.functional.interpolate(picture, (height, width), mode="bilinear", antialias=True)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-import torch
 
 from bigs.data.base import Clip
 from bigs.threads import side_by_side
@@ -151,16 +150,3 @@ def _color_counts(colors: np.ndarray, frames: np.ndarray) -> np.ndarray:
     counts = np.zeros((_COLOR_CELLS,) * 3)
     np.add.at(counts, _cells(colors), frames)
     return scipy.ndimage.gaussian_filter(counts, 1.0, mode="constant")
-
-
-def share_per_pixel(masks: np.ndarray, height: int, width: int, threads: int | None = None) -> torch.Tensor:
-    """Masks [T, H, W] (bool) as shares [T, height, width] of smaller pixels.
-
-    `threads` is as in `side_by_side`.
-    """
-
-    def share(mask: np.ndarray) -> torch.Tensor:
-        whole = torch.from_numpy(mask)[None, None].float()
-        return torch.nn.functional.interpolate(whole, (height, width), mode="bilinear", antialias=True)
-
-    return torch.cat(side_by_side(share, masks, threads))[:, 0]

@@ -10,8 +10,7 @@ import torch
 from toy_clips import painted_clip
 
 from bigs.data.base import Clip
-from bigs.train.loop.targets import crop_box, load_targets
-from bigs.train.start.background import share_per_pixel
+from bigs.train.loop.targets import crop_box, load_targets, share_per_pixel
 
 WIDTH, HEIGHT = 90, 64
 K = np.array([[80.0, 0.0, 47.3], [0.0, 84.0, 29.8], [0.0, 0.0, 1.0]])
@@ -120,9 +119,9 @@ def test_an_unlabelled_clip_is_not_cropped(tmp_path: Path) -> None:
 
 
 def test_share_per_pixel_is_the_area() -> None:
-    mask = np.zeros((1, 32, 32), dtype=bool)
-    mask[0, 8:24, 10:20] = True
+    mask = np.zeros((32, 32), dtype=bool)
+    mask[8:24, 10:20] = True
     share = share_per_pixel(mask, 8, 8)
-    assert share.shape == (1, 8, 8)
+    assert share.shape == (8, 8)
     assert share.sum().item() == pytest.approx(mask.sum() / 16, rel=0.01)
-    assert share[0, 4, 3] > 0.95 and share[0, 0, 0] == 0
+    assert share[4, 3] > 0.95 and share[0, 0] == 0
