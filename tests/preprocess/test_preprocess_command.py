@@ -14,6 +14,8 @@ from taken_apart import Given, place_true_object
 
 from bigs.data.formats.hold import load_hold
 from bigs.data.images import read_image
+from bigs.train.plan.config import OptimizeStage
+from bigs.train.plan.presets import SMOKE
 from bigs.viewer.preview import write_video
 
 Call = Callable[..., Answer]
@@ -35,7 +37,9 @@ def options(given: Given) -> list[str]:
 def test_a_video_becomes_a_finished_run(call: Call, given: Given, video: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     place_true_object(run / "clip", given.truth)
-    command = ["reconstruct", str(video), "--out", str(run), "--preset", "smoke", *options(given)]
+    stages = [stage.name for stage in SMOKE.stages if isinstance(stage, OptimizeStage)]
+    quick = [f"--set=stages.{stage}.{change}" for stage in stages for change in ("steps=2", "image_size=40")]
+    command = ["reconstruct", str(video), "--out", str(run), "--preset", "smoke", *quick, *options(given)]
     answer = call(*command)
     assert answer.code == 0, answer.err
     assert "frames  made" in answer.out and "hands   made" in answer.out and "build   made" in answer.out

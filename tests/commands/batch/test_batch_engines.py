@@ -11,6 +11,7 @@ from pathlib import Path
 import fake_slurm
 import pytest
 import yaml
+from command_line import Answer
 from family import Family
 
 from bigs.data.synthetic import make_clip
@@ -82,7 +83,11 @@ def statuses(out: Path) -> dict[str, dict]:
 
 @pytest.mark.parametrize("engine", ["ray", "processes"])
 def test_a_worker_is_killed_mid_clip(
-    batch: Callable[..., subprocess.Popen[bytes]], clip: Path, tmp_path: Path, engine: str
+    batch: Callable[..., subprocess.Popen[bytes]],
+    call: Callable[..., Answer],
+    clip: Path,
+    tmp_path: Path,
+    engine: str,
 ) -> None:
     if engine == "ray":
         pytest.importorskip("ray", reason="needs the extra 'ray'")
@@ -124,8 +129,9 @@ def test_a_worker_is_killed_mid_clip(
         return
     # Called again, nothing is done twice: only the missing clip is tried.
     before = {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names}
-    assert batch(path, "--out", out, "--threads", "1").wait() == 5
-    assert "clips were finished before; 1 attempts" in said.read_text()
+    again = call("batch", path, "--out", out, "--threads", "1")
+    assert again.code == 5
+    assert "clips were finished before; 1 attempts" in again.out + again.err
     assert {name: (out / name / "scene.safetensors").stat().st_mtime_ns for name in names} == before
 
 

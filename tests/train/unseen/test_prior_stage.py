@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,11 +53,16 @@ def run(
     return fit(clip, hands, plan, denoiser=prior, **more)  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module")
+def before(one_side: Clip, both_hands: dict[Side, HandModel]) -> Scene:
+    """What the prior finds. Read it, never change it."""
+    return run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)[0]
+
+
 def test_the_unseen_part_moves_and_its_surface_follows(
-    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, before: Scene
 ) -> None:
     plan = replace(PLAN, stages=(SplitStage(parts=1), replace(STAGE, damage=1e9)))
-    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
     after, report = run(one_side, both_hands, plan, prior)
     assert report.skipped == []
     assert "moved what was not seen by" in report.facts["prior"]
@@ -69,10 +75,9 @@ def test_the_unseen_part_moves_and_its_surface_follows(
 
 
 def test_what_shows_in_a_frame_stays(
-    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, before: Scene
 ) -> None:
     """To the last bit, even where fewer frames show it than count as having seen it; nor does more show."""
-    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
     wild = replace(STAGE, steps=12, lr_shift=2e-3, damage=1e9, frame_weight=0.0)
     after, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), wild)), prior)
     assert "moved" in report.facts["prior"]
@@ -89,11 +94,10 @@ def test_what_shows_in_a_frame_stays(
 
 
 def test_a_prior_that_does_not_know_the_object_is_left_out(
-    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, before: Scene
 ) -> None:
     """It is right about what it learned from, and not about this object: the scene stays as it was."""
     knowing = PixelDenoiser(prior.net, familiar=1e-4)
-    before, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
     after, report = run(one_side, both_hands, PLAN, knowing)
     assert "the prior does not know this object" in report.skipped[0]
     for name, value in before.state_dict().items():
@@ -103,16 +107,15 @@ def test_a_prior_that_does_not_know_the_object_is_left_out(
 
 
 def test_the_clips_frames_hold_what_they_show(
-    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser
+    one_side: Clip, both_hands: dict[Side, HandModel], prior: PixelDenoiser, before: Scene
 ) -> None:
     """The same wild prior changes what was seen much less while held, though it still moves the rest."""
     every = torch.arange(5)
-    start = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)[0]
     unknown = np.zeros((5, one_side.height, one_side.width), dtype=bool)
-    evidence = EvidenceSource(TargetSource(one_side, unknown), start, PLAN, None).evidence(
+    evidence = EvidenceSource(TargetSource(one_side, unknown), before, PLAN, None).evidence(
         replace(SMOKE.stages[0], image_size=0)
     )
-    step = Step(start, evidence, start.canonical(("object",)), Selection(every, ("object",), labels=False))
+    step = Step(before, evidence, before.canonical(("object",)), Selection(every, ("object",), labels=False))
     # Pictures of what was found take the place of the clip's.
     found = replace(evidence, targets=replace(evidence.targets, images=step.together.colors.detach()))
     changes = []
@@ -122,22 +125,20 @@ def test_the_clips_frames_hold_what_they_show(
         assert "moved" in report.facts["prior"]
         changes.append(image_error(scene, found, ("object",), every))
     assert changes[1] < 0.5 * changes[0], changes
-    assert float((scene.object_splats().means - start.object_splats().means).abs().max()) > 1e-4
+    assert float((scene.object_splats().means - before.object_splats().means).abs().max()) > 1e-4
 
 
-def test_an_object_that_leaves_its_mask_is_measured(
-    one_side: Clip, both_hands: dict[Side, HandModel]
-) -> None:
-    scene, _ = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1),)), None)
+def test_an_object_that_leaves_its_mask_is_measured(one_side: Clip, before: Scene) -> None:
+    scene = copy.deepcopy(before)
     unknown = np.zeros((5, one_side.height, one_side.width), dtype=bool)
     evidence = EvidenceSource(TargetSource(one_side, unknown), scene, PLAN, None).evidence(
         replace(SMOKE.stages[0], image_size=0)
     )
     every = torch.arange(5)
-    before = overflow(scene, evidence, every)
-    assert (before >= 1.0).all() and (before < 1.5).all()
+    inside = overflow(scene, evidence, every)
+    assert (inside >= 1.0).all() and (inside < 1.5).all()
     scene.object_splats.shift += 0.02
-    assert (overflow(scene, evidence, every) > before + 0.2).all()
+    assert (overflow(scene, evidence, every) > inside + 0.2).all()
     # Where anything may hide it, it may be.
     hidden = replace(
         evidence, targets=replace(evidence.targets, unknown=torch.ones_like(evidence.targets.unknown))
