@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -135,23 +136,34 @@ def test_mirror_planes_stand_at_whole_parts_of_a_turn() -> None:
         assert np.abs(angle - np.array([45.0, 60.0, 90.0])).min() < 5.0
 
 
-def test_planes_at_other_angles_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+class Box(NamedTuple):
+    """A box of one colour, and its symmetries."""
+
+    surface: SeenSurface
+    empty: EmptySpace
+    found: list[Symmetry]
+
+
+@pytest.fixture(scope="module")
+def plain_box() -> Box:
+    box = trimesh.creation.box((0.12, 0.06, 0.09))
+    surface, _ = seen_of(box)
+    plain, empty = surface._replace(colors=np.full_like(surface.colors, 0.5)), outside(box)
+    return Box(plain, empty, find_symmetries(plain, empty))
+
+
+def test_planes_at_other_angles_are_left(plain_box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
     """If no two planes could stand at right angles, a box would keep its first alone."""
-    box = trimesh.creation.box((0.12, 0.06, 0.09))
-    surface, _ = seen_of(box)
-    plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
-    assert len(find_symmetries(plain, outside(box))) > 1
+    assert len(plain_box.found) > 1
     monkeypatch.setattr(symmetry_search, "_BETWEEN_PLANES", np.array([20.0]))
-    assert len(find_symmetries(plain, outside(box))) == 1
+    assert len(find_symmetries(plain_box.surface, plain_box.empty)) == 1
 
 
-def test_later_planes_need_more_evidence() -> None:
+def test_later_planes_need_more_evidence(plain_box: Box) -> None:
     """Samples that the first plane has added support a second one whether it is right or wrong."""
-    box = trimesh.creation.box((0.12, 0.06, 0.09))
-    surface, _ = seen_of(box)
-    plain = surface._replace(colors=np.full_like(surface.colors, 0.5))
-    assert len(find_symmetries(plain, outside(box))) > 1
-    assert len(find_symmetries(plain, outside(box), SymmetryConfig(least_share_later=1.01))) == 1
+    assert len(plain_box.found) > 1
+    stricter = SymmetryConfig(least_share_later=1.01)
+    assert len(find_symmetries(plain_box.surface, plain_box.empty, stricter)) == 1
 
 
 def test_too_little_was_seen() -> None:
