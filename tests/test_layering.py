@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -162,8 +163,14 @@ def imports_of(path: Path, tree: ast.AST) -> Iterator[Import]:
                 )
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
+@cache
 def all_imports() -> list[Import]:
-    return [found for path in sources() for found in imports_of(path, ast.parse(path.read_text("utf-8")))]
+    return [found for path in sources() for found in imports_of(path, tree_of(path))]
 
 
 def offence(found: Import) -> str | None:
@@ -259,8 +266,9 @@ def test_only_the_command_line_prints_or_exits() -> None:
     for path in sources():
         if name_of(path).split(".")[0] == "cli":
             continue
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            place = f"{path.relative_to(ROOT.parent)}:{getattr(node, 'lineno', 0)}"
+        file = path.relative_to(ROOT.parent)
+        for node in ast.walk(tree_of(path)):
+            place = f"{file}:{getattr(node, 'lineno', 0)}"
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 if node.func.id in ("print", "exit", "quit", "input"):
                     offences.append(f"{place}: calls {node.func.id}()")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from command_line import run_bigs
+from command_line import Answer
 from safetensors.numpy import load_file
 from short_plans import short
 from small_vgg import torchvision_state
@@ -51,13 +52,15 @@ def test_hands_may_be_kept_apart(tiny_clip: Path, tmp_path: Path) -> None:
     assert not np.array_equal(written["right.betas"], written["left.betas"])
 
 
-def test_a_network_for_the_perceptual_term(tiny_clip: Path, tmp_path: Path) -> None:
+def test_a_network_for_the_perceptual_term(
+    call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path
+) -> None:
     """Its file goes in by an option, and its path into the configuration."""
     weights, out = tmp_path / "vgg16.pth", tmp_path / "run"
     torch.save(torchvision_state(), weights)
     stages = [stage.name for stage in PRESETS["smoke"].stages if isinstance(stage, OptimizeStage)]
     quick = [f"--set=stages.{stage}.steps=1" for stage in stages]
-    answer = run_bigs(
+    answer = call(
         *(
             "reconstruct",
             tiny_clip,
