@@ -12,13 +12,13 @@ import torch
 
 from bigs.fused.shape import times_empty
 from bigs.geometry.coverage import ObjectViews, seen_in
-from bigs.geometry.mesh import face_areas, sample_surface, vertex_normals
+from bigs.geometry.mesh import face_areas, midpoint_subdivision, sample_surface, vertex_normals
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
 from bigs.train.plan.config import OpeningConfig
 from bigs.train.unseen.visibility import TOLERANCE, object_views
 
-# Samples of a hand's surface that may show, and of the object's that may hide it.
+# At least so many samples of a hand's surface that may show, about so many of the object's that may hide it.
 _HAND_SAMPLES, _OCCLUDERS = 8000, 20_000
 # A hand's outline may be wrong by so many pixels.
 _MARGIN = 2
@@ -78,17 +78,27 @@ def _hands_behind(
     posed = scene.at(torch.arange(scene.n_frames))
     count = np.zeros(len(verts), dtype=np.int64)
     for side in scene.sides:
+        model = scene.hand_model(side)
+        # The same places in every frame: spreading samples anew takes seconds.
+        follow = _places(model.faces.numpy(), len(model.v_template))
         with torch.no_grad():
             hand = posed.in_object_frame(posed.verts(side)).double().numpy()
-        faces = scene.hand_model(side).faces.numpy()
         shown = evidence.targets.shares[side].numpy() > 0.5
         inside = scipy.ndimage.binary_erosion(shown, np.ones((1, 3, 3)), iterations=_MARGIN)
         for t in np.flatnonzero(inside.any(axis=(1, 2))):
-            samples, _ = sample_surface(hand[t], faces, _HAND_SAMPLES)
             one = slice(t, t + 1)
             frame = ObjectViews(inside[one], views.K, views.rotations[one], views.centers[one])
-            count += times_empty(frame.shown, frame.poses, verts, samples, depth)
+            count += times_empty(frame.shown, frame.poses, verts, follow @ hand[t], depth)
     return count
+
+
+def _places(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
+    """Vertices and midpoints of a mesh of `count` vertices, halved until they are many enough: [N, count]."""
+    follow = scipy.sparse.identity(count, format="csr")
+    while follow.shape[0] < _HAND_SAMPLES:
+        step, faces = midpoint_subdivision(faces, follow.shape[0])
+        follow = step @ follow
+    return follow
 
 
 def _variation(
