@@ -264,7 +264,8 @@ DEMO = replace(
 )
 
 # Finer images and fields, and more steps where colours decide. Silhouettes alone get their steps of `fast`:
-# more of them bend hidden fingers and change the hands' size to fit what masks do not tell.
+# more of them bend hidden fingers and change the hands' size to fit what masks do not tell. In the many steps
+# of `detail` fingers move slowly for the same reason.
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
@@ -283,7 +284,12 @@ FULL = replace(
         _REGRASP,
         SplitStage(),
         replace(_JOINT, steps=300),
-        replace(_DETAIL, steps=1000, image_size=640),
+        replace(
+            _DETAIL,
+            steps=1000,
+            image_size=640,
+            lrs=_DETAIL.lrs | {"hand.pose": 0.0016, "hand.grasp_pose": 0.0008},
+        ),
         CompletionStage(),
         GuidanceStage(steps=600),
     ),
