@@ -13,7 +13,11 @@ import numpy as np
 from bigs.data.images import read_image, read_mask
 from bigs.data.optics import Optics
 from bigs.names import check_name
-from bigs.types import Entity, Side
+from bigs.types import MASK_VALUES, Entity, Side
+
+# Every label with the hands' exchanged.
+_EXCHANGED = np.arange(256, dtype=np.uint8)
+_EXCHANGED[[MASK_VALUES["right"], MASK_VALUES["left"]]] = MASK_VALUES["left"], MASK_VALUES["right"]
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class Clip:
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files, for every entity
     annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
+    swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:
@@ -91,8 +96,10 @@ class Clip:
     def mask(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""
         if self.optics is None:
-            return read_mask(self.mask_paths[t], (self.width, self.height))
-        return self.optics.pinhole(t, read_mask(self.mask_paths[t], self.optics.file_size), order=0)
+            labels = read_mask(self.mask_paths[t], (self.width, self.height))
+        else:
+            labels = self.optics.pinhole(t, read_mask(self.mask_paths[t], self.optics.file_size), order=0)
+        return _EXCHANGED[labels] if self.swapped is not None and self.swapped[t] else labels
 
     def has_pixels(self, entity: Entity) -> np.ndarray:
         """In which frames the masks show `entity`, [T] bool."""

@@ -49,6 +49,7 @@ def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
         hands=hands,
         object=obj,
         optics=None if clip.optics is None else clip.optics.chosen(frames),
+        swapped=None if clip.swapped is None else clip.swapped[frames],
         mask_areas={entity: areas[frames] for entity, areas in clip.mask_areas.items()},
     )
 

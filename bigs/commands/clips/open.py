@@ -11,7 +11,9 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.formats.layouts import load_clip
 from bigs.data.plausible import plausible
+from bigs.data.swapped_labels import with_labels_sorted
 from bigs.hand import HandModel
+from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side
 
 
@@ -26,7 +28,10 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
         side: hand_models[side].rest_joints(torch.as_tensor(track.betas, dtype=torch.float32))[0].numpy()
         for side, track in clip.hands.items()
     }
-    return plausible(clip, wrists)
+    clip = plausible(clip, wrists)
+    if clip.annotated:
+        return clip
+    return with_labels_sorted(clip, initial_trajectory(clip, hand_models).joints)
 
 
 def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
