@@ -144,10 +144,12 @@ def _misplaced(
         if (behind | away)[valid].all() and wrong.any():
             raise InputError(
                 f"{clip.folder}: {name}: expected {NEAREST_M:g} to {FARTHEST_M:g} m in front of the camera, "
-                f"found it {found} in {_frames(wrong)}"
+                f"found it {found} in {frames_in_words(wrong)}"
             )
         if wrong.any():
-            notes.append(f"{name}: {found} in {_frames(wrong)}; taken as missing and filled from neighbours")
+            notes.append(
+                f"{name}: {found} in {frames_in_words(wrong)}; taken as missing and filled from neighbours"
+            )
     return behind | away
 
 
@@ -156,7 +158,7 @@ def _check_filled(clip: Clip, entity: Entity, places: np.ndarray) -> None:
     if behind.any():
         raise InputError(
             f"{clip.folder}: {entity}: expected interpolated poses in front of the camera, found "
-            f"poses behind it in {_frames(behind)}"
+            f"poses behind it in {frames_in_words(behind)}"
         )
 
 
@@ -194,7 +196,7 @@ def _check_shift(clip: Clip) -> None:
         )
 
 
-def _frames(flags: np.ndarray) -> str:
+def frames_in_words(flags: np.ndarray) -> str:
     """Some frames as text, the first of them by number."""
     numbers = np.flatnonzero(flags).tolist()
     if len(numbers) == 1:

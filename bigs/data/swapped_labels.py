@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.data.plausible import frames_in_words
 from bigs.threads import side_by_side
 from bigs.types import MASK_VALUES, SIDES, Side
 
@@ -39,8 +40,7 @@ def with_labels_sorted(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Clip:
     areas = dict(clip.mask_areas)
     for side, other in zip(SIDES, reversed(SIDES), strict=True):
         areas[side] = np.where(swapped, clip.mask_areas[other], clip.mask_areas[side])
-    numbers = ", ".join(map(str, np.flatnonzero(swapped)))
-    note = f"masks: right and left hand exchanged in frames {numbers}; changed back"
+    note = f"masks: right and left hand exchanged in {frames_in_words(swapped)}; changed back"
     return replace(
         clip,
         swapped=swapped,

@@ -53,8 +53,8 @@ def test_exchanged_labels_are_changed_back(
 ) -> None:
     clip = open_clip(exchanged(tiny_clip, tmp_path, frames, blank), both_hands)
     assert clip.swapped is not None and np.flatnonzero(clip.swapped).tolist() == frames
-    numbers = ", ".join(map(str, frames))
-    assert clip.notes == (f"masks: right and left hand exchanged in frames {numbers}; changed back",)
+    numbers = f"{len(frames)} frames ({', '.join(map(str, frames))})" if frames[1:] else f"frame {frames[0]}"
+    assert clip.notes == (f"masks: right and left hand exchanged in {numbers}; changed back",)
     for t in range(len(clip)):
         if t not in blank:
             np.testing.assert_array_equal(clip.mask(t), clean.mask(t))
