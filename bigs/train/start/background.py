@@ -3,7 +3,8 @@
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
 background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
 most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
-colours, the one that the clip's occluders have elsewhere belongs to an occluder.
+colours, the one that the clip's occluders have elsewhere belongs to an occluder. Where the exposure wavers,
+images are brought to one exposure first.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _ROUNDS = 8
 _NEIGHBOURHOOD = 2.0
 # Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
+# Exposures that differ by less are the same, and what is darker than this says nothing of them.
+_STEADY, _DARK = 0.02, 0.1
 # If more of the background moves than this, the camera moves or the light changes, and nothing is known.
 _USELESS_SHARE = 0.5
 
@@ -44,7 +47,12 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     frames = range(len(clip))
     images = np.stack(side_by_side(lambda t: clip.image(t)[::step, ::step], frames))
     background = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames)) == 0
-    still = _still_background(_looks(images, background))
+    looks = _looks(images, background)
+    gains = _gains(images, background, looks.usual)
+    if (gains != 1.0).any():
+        images = np.stack([_divided(image, gain) for image, gain in zip(images, gains, strict=True)])
+        looks = _looks(images, background)
+    still = _still_background(looks)
     # A frame at a time: the whole clip in floats is large.
     unknown = (
         np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
@@ -63,6 +71,24 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     near = scipy.ndimage.binary_dilation(unknown, cross, iterations=2 * _CLOSE)
     unknown |= closed & near & background
     return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+
+
+def _gains(images: np.ndarray, background: np.ndarray, usual: np.ndarray) -> np.ndarray:
+    """The exposure [T] of images [T, H, W, 3] relative to their background's usual look [H, W, 3].
+
+    It is the median over pixels, of which occluders cover less than half; 1 where it is about that.
+    """
+    bright = usual.mean(-1) > _DARK
+    gains = np.ones(len(images))
+    for t, image in enumerate(images):
+        chosen = background[t] & bright
+        if chosen.any():
+            gains[t] = np.median(_floats(image[chosen]).mean(-1) / usual[chosen].mean(-1))
+    return np.where(np.abs(gains - 1.0) > _STEADY, gains, 1.0)
+
+
+def _divided(image: np.ndarray, gain: float) -> np.ndarray:
+    return image if gain == 1.0 else (image / gain + 0.5).clip(0.0, 255.0).astype(np.uint8)
 
 
 class _Looks(NamedTuple):

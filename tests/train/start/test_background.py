@@ -53,6 +53,19 @@ def test_finds_a_moving_sleeve(tmp_path: Path, rng: np.random.Generator) -> None
     assert found[~near].mean() < 0.005
 
 
+def test_exposure_that_wavers_hides_no_background(tmp_path: Path, rng: np.random.Generator) -> None:
+    hand, sleeve = moving_box(25, 5, 12, 12, 5), moving_box(37, 5, 14, 12, 5)
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[hand] = [0.8, 0.6, 0.5]
+    images[sleeve] = [0.1, 0.15, 0.9]
+    gains = rng.uniform(0.8, 1.2, FRAMES)[:, None, None, None]
+    clip = painted_clip(tmp_path, to_bytes(gains * images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    found = unknown_occluders(clip)
+    assert found[sleeve].mean() > 0.95
+    near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 7, 7)))
+    assert found[~near].mean() < 0.01
+
+
 def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator) -> None:
     """A forearm that stays for two thirds of the time is no background, and what it hides then is."""
     sleeve = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=bool)
