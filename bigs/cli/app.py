@@ -53,6 +53,7 @@ COMMANDS: Commands = {
         "preprocess": bench.bench_preprocess,
         "reconstruct": bench.bench_reconstruct,
         "robustness": bench.bench_robustness,
+        "scale": bench.bench_scale,
     },
 }
 # Help texts of commands that have subcommands.

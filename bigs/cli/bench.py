@@ -221,3 +221,33 @@ def bench_motion(
     with telling() as tell:
         tables = run(plan, out, tell)
     print_tables(tables, out)
+
+
+def bench_scale(
+    clip: Annotated[Path, tyro.conf.Positional],
+    out: Path = Path("bench"),
+    frames: tuple[int, ...] = (60, 300),
+    enlarge: tuple[float, ...] = (1.0, 2.0),
+    preset: Preset = "fast",
+    hand_model: Path | None = None,
+    threads: int = 0,
+) -> None:
+    """Time whole runs of a clip with more frames and pixels, and tell their peak memory.
+
+    Args:
+        clip: the clip; played to and fro where it has fewer frames, and enlarged.
+        out: folder for the clips made, the runs, scale.md and scale.json; finished runs are kept.
+        frames: numbers of frames.
+        enlarge: factors on the width and height of the pictures.
+        preset: preset to run.
+        hand_model: folder with MANO_RIGHT and MANO_LEFT (.npz or .pkl); without it the built-in hand is used.
+        threads: CPU threads; 0 uses all cores.
+    """
+    use_threads(threads)
+    from bigs.commands.bench.scale import ScalePlan
+    from bigs.commands.bench.scale import bench_scale as run
+
+    with telling() as tell:
+        table, failed = run(ScalePlan(clip, frames, enlarge, preset, hand_model), out, tell)
+    print_tables([table], out)
+    fail_for(failed)

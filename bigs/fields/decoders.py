@@ -3,7 +3,8 @@
 Each ends in heads whose last layer starts at zero and whose output is *added* to a start value in the
 head's own space (logits, logarithms, 6-D rotations). A fresh decoder therefore reproduces the start
 (skinning weights to 2e-3, for the sake of finite logarithms), which replaces the released code's 7500-step
-fit of the network to the same values.
+fit of the network to the same values. While its heads are zero and do not learn it gives that start without
+any work.
 """
 
 from __future__ import annotations
@@ -50,6 +51,11 @@ def zero_head(in_features: int, out_features: int) -> nn.Linear:
     return layer
 
 
+def is_fresh(*heads: nn.Linear) -> bool:
+    """Whether heads give zero whatever their input, now and after the next step."""
+    return not any(p.requires_grad or bool(p.any()) for head in heads for p in head.parameters())
+
+
 class AppearanceDecoder(nn.Module):
     """f_A: features to colour and opacity, added to start values as logits."""
 
@@ -85,6 +91,9 @@ class GeometryDecoder(nn.Module):
 
     def forward(self, features: Tensor) -> Geometry:
         """Features [N, F] to offsets [N, 3] (metres), rotations [N, 3, 3] and log scales [N, 3]."""
+        if is_fresh(self.offset, self.rotation, self.scale):
+            zeros = features.new_zeros(len(features), 3)
+            return Geometry(zeros, torch.eye(3, dtype=features.dtype).expand(len(features), 3, 3), zeros)
         hidden = self.trunk(features)
         return Geometry(
             self.max_offset * torch.tanh(self.offset(hidden)),
@@ -104,4 +113,7 @@ class SkinningDecoder(nn.Module):
     def forward(self, features: Tensor, start_weights: Tensor) -> Tensor:
         """Features [N, F] and start weights [N, J] to weights [N, J] that sum to one."""
         # 1e-4 keeps the logarithm finite where the template has no weight; such a joint can still gain some.
-        return torch.softmax(self.weights(self.trunk(features)) + torch.log(start_weights + 1e-4), dim=-1)
+        start = torch.log(start_weights + 1e-4)
+        if is_fresh(self.weights):
+            return torch.softmax(start, dim=-1)
+        return torch.softmax(self.weights(self.trunk(features)) + start, dim=-1)

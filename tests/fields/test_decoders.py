@@ -87,3 +87,19 @@ def test_gradients_of_a_disturbed_geometry(features) -> None:
     decoder = GeometryDecoder(F, 4, max_offset=0.3).double()
     disturb(decoder, 0.3)
     assert torch.autograd.gradcheck(decoder, features[:2].double().requires_grad_())
+
+
+@pytest.mark.parametrize("decoder", [GeometryDecoder(F, 8, 0.003), SkinningDecoder(F, 8)])
+def test_a_fresh_decoder_that_does_not_learn_gives_the_same_without_its_network(
+    features, decoder, monkeypatch
+) -> None:
+    starts = (torch.full((N, 16), 1 / 16),) if isinstance(decoder, SkinningDecoder) else ()
+    worked = decoder(features, *starts)
+    decoder.requires_grad_(False)
+    monkeypatch.setattr(decoder.trunk, "forward", None)  # fails if called
+    idle = decoder(features, *starts)
+    for a, b in zip(*(((v,) if torch.is_tensor(v) else v) for v in (worked, idle)), strict=True):
+        assert torch.equal(a, b) and not b.requires_grad
+    disturb(decoder)
+    with pytest.raises(TypeError):
+        decoder(features, *starts)

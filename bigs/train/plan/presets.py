@@ -93,6 +93,7 @@ _CONTACT = OptimizeStage(
     weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "penetration": 0.01},
     image_size=160,
 )
+# The hand's shape and skinning are the template's: colours of so few steps say nothing better about them.
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
@@ -100,7 +101,6 @@ _APPEARANCE = OptimizeStage(
     lrs={
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
-        "hand.skinning": 1e-4,
         "hand.color": 1e-2,
         "object.triplane": 1e-2,
         "object.appearance": 2e-3,
@@ -108,7 +108,7 @@ _APPEARANCE = OptimizeStage(
         "scene.light": 1e-2,
         "scene.shade": 1e-2,
     },
-    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0, "lbs": 1000.0},
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
     image_size=240,
     frames_per_step=6,
 )

@@ -142,6 +142,8 @@ pub use lists::radix_sort::radix_sort;
 pub use math::radix_key::RadixKey;
 pub use math::real::Real;
 pub use memory::pool::release_memory;
+#[doc(hidden)]
+pub use memory::results::filled_with;
 pub use pipeline::scalar::Scalar;
 #[doc(hidden)]
 pub use simd::Vectors;

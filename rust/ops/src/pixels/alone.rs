@@ -1,6 +1,6 @@
 //! One subject rendered without the others.
 
-use bigs_raster::Real;
+use bigs_raster::{Real, filled_with};
 use rayon::prelude::*;
 
 use crate::OpsError;
@@ -100,7 +100,7 @@ impl<T: Real> Alone<'_, T> {
         let colors = area(3.0 * terms.own);
         let [absolute, squared, outside] = [v[0] / colors, v[1] / colors, v[2] / area(terms.own)].map(T::of);
         let size = self.frames.pixels.max(1);
-        let mut v_alphas = vec![T::ZERO; self.alphas.len()];
+        let mut v_alphas = filled_with("v_alphas", T::ZERO, &[self.alphas.len()])?;
         v_alphas
             .par_chunks_exact_mut(size)
             .enumerate()
@@ -110,7 +110,7 @@ impl<T: Real> Alone<'_, T> {
                     *v = outside * two * (alpha - nearest(alpha, own, hidden));
                 }
             });
-        let mut v_colors = vec![T::ZERO; self.colors.map_or(0, <[T]>::len)];
+        let mut v_colors = filled_with("v_colors", T::ZERO, &[self.colors.map_or(0, <[T]>::len)])?;
         v_colors
             .par_chunks_exact_mut(3 * size)
             .enumerate()

@@ -1,6 +1,6 @@
 //! All subjects rendered together.
 
-use bigs_raster::Real;
+use bigs_raster::{Real, filled_with};
 use rayon::prelude::*;
 
 use crate::OpsError;
@@ -159,8 +159,8 @@ impl<T: Real> Together<'_, T> {
         ]
         .map(T::of);
         let covered = T::of(self.covered);
-        let mut v_colors = vec![T::ZERO; self.colors.len()];
-        let mut v_alphas = vec![T::ZERO; self.alphas.len()];
+        let mut v_colors = filled_with("v_colors", T::ZERO, &[self.colors.len()])?;
+        let mut v_alphas = filled_with("v_alphas", T::ZERO, &[self.alphas.len()])?;
         let size = self.frames.pixels.max(1);
         (
             v_colors.par_chunks_exact_mut(size * self.channels),

@@ -7,7 +7,7 @@ mod bones;
 mod chunk;
 mod light;
 
-use bigs_raster::{SimdLevel, Vectors};
+use bigs_raster::{SimdLevel, Vectors, filled_with};
 use rayon::prelude::*;
 
 use crate::OpsError;
@@ -241,9 +241,9 @@ impl<'a, T: Vectors> Pose<'a, T> {
             0
         };
         let mut out = PosedGaussians {
-            means: vec![[T::ZERO; 3]; self.frames * total],
-            quats: vec![[T::ZERO; 4]; shown],
-            colors: vec![T::ZERO; shown * channels],
+            means: filled_with("means", [T::ZERO; 3], &[self.frames, total])?,
+            quats: filled_with("quats", [T::ZERO; 4], &[shown])?,
+            colors: filled_with("colors", T::ZERO, &[shown, channels])?,
         };
         let (bones, chunks) = (self.bones(), self.chunks());
         let lengths = self.lengths(&chunks);

@@ -17,11 +17,11 @@ pub(crate) fn product(sizes: &[usize]) -> usize {
         .fold(1, |product, &size| product.saturating_mul(size))
 }
 
-/// An array of as many values as the product of `sizes`.
+/// An array of as many values as the product of `sizes`; a large one is filled by all threads.
 ///
 /// # Errors
 /// [`RasterError::OutOfMemory`].
-pub(crate) fn filled_with<U: Copy + Send + Sync>(
+pub fn filled_with<U: Copy + Send + Sync>(
     name: &'static str,
     value: U,
     sizes: &[usize],
