@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 # What numpy and zipfile raise for an archive that is damaged, encrypted or of an unknown compression.
 ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
@@ -73,9 +72,22 @@ def check_shape(name: str, array: Any, shape: Sequence[int | str | None]) -> Non
         raise InputError(f"{name}: expected shape [{expected}], found {list(found)}")
 
 
+def _is_tensor(value: Any) -> bool:
+    # By name: to load torch takes longer than all that `bigs --help` does.
+    return any(f"{kind.__module__}.{kind.__name__}" == "torch.Tensor" for kind in type(value).__mro__)
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray) or _is_tensor(value)
+
+
+def _as_numpy(array: Any) -> np.ndarray:
+    return np.asarray(array.detach().cpu() if _is_tensor(array) else array)
+
+
 def check_finite(name: str, array: Any) -> None:
     """Raise `InputError` naming the first index at which `array` (numpy or torch) is not finite."""
-    values = array.detach().cpu().numpy() if isinstance(array, torch.Tensor) else np.asarray(array)
+    values = _as_numpy(array)
     finite = np.isfinite(values)
     if not finite.all():
         index = tuple(int(i) for i in np.argwhere(~finite)[0])
@@ -98,7 +110,7 @@ def check_rotations(name: str, matrices: Any) -> None:
 
 def check_faces(name: str, faces: Any, vertex_count: int) -> None:
     """Raise `InputError` unless `faces` [F, 3] are whole numbers that count `vertex_count` vertices."""
-    values = faces.detach().cpu().numpy() if isinstance(faces, torch.Tensor) else np.asarray(faces)
+    values = _as_numpy(faces)
     check_shape(name, values, ("F", 3))
     if values.dtype.kind not in "iu" and not (values == np.floor(values)).all():
         raise InputError(f"{name}: expected whole numbers, found {values.dtype}")
@@ -131,7 +143,7 @@ def shown(value: Any) -> str:
     """
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * _SHOWN:
         return f"an integer of about {math.ceil(value.bit_length() * math.log10(2))} digits"
-    if isinstance(value, np.ndarray | torch.Tensor) and math.prod(value.shape) > 16:
+    if _is_array(value) and math.prod(value.shape) > 16:
         return f"an array of shape {list(value.shape)}"
     try:
         text = " ".join(_BRIEFLY.repr(value).split())
@@ -151,7 +163,7 @@ def check_choice(name: str, value: Any, choices: Iterable[Any], kind: str = "nam
     """
     accepted = list(choices)
     # An array cannot be a choice, and would compare entry by entry.
-    if isinstance(value, np.ndarray | torch.Tensor) or value not in accepted:
+    if _is_array(value) or value not in accepted:
         raise InputError(f"{name}: {expected_among(value, accepted, kind)}")
 
 

@@ -237,3 +237,9 @@ import bigs.cli
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == [threads]
+
+
+def test_help_and_refusals_do_not_wait_for_torch() -> None:
+    script = "import sys, bigs.cli.app; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
