@@ -3,8 +3,11 @@
 //!
 //! An object is a subject with one bone and weights of 1.
 
+mod backward;
 mod bones;
 mod chunk;
+mod forward;
+mod gradients;
 mod light;
 
 use bigs_raster::{SimdLevel, Vectors, filled_with};
@@ -12,9 +15,14 @@ use rayon::prelude::*;
 
 use crate::OpsError;
 use crate::checks::check_length;
-use crate::pose::bones::{Bone, Bones};
-use crate::pose::chunk::{Backward, CHUNK, ChunkGradients, Forward, Posed, Pulls};
+use crate::pose::backward::{Backward, ChunkGradients, Pulls};
+use crate::pose::bones::Bones;
+use crate::pose::chunk::CHUNK;
+use crate::pose::forward::{Forward, Posed};
+use crate::pose::gradients::{add_all, joined};
 use crate::pose::light::CLIP;
+
+pub use gradients::{PoseGradients, SubjectGradients, Wanted};
 
 /// One subject's Gaussians, N of them, and its K bones in every one of B frames.
 #[derive(Clone, Copy, Debug)]
@@ -93,44 +101,6 @@ pub struct PosedGaussians<T> {
     pub quats: Vec<[T; 4]>,
     /// B × N × (3, or 3 and a label for each subject); none likewise.
     pub colors: Vec<T>,
-}
-
-/// Which gradients of a subject are wanted.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Wanted {
-    /// Of rest points.
-    pub points: bool,
-    /// Of skinning weights.
-    pub weights: bool,
-    /// Of bones.
-    pub bones: bool,
-    /// Of quaternions.
-    pub quats: bool,
-    /// Of albedos.
-    pub albedo: bool,
-    /// Of shade; the clip's light comes with it.
-    pub light: bool,
-}
-
-/// Gradients of a subject's arrays; empty where not wanted.
-#[derive(Clone, Debug, PartialEq)]
-#[allow(missing_docs)]
-pub struct SubjectGradients<T> {
-    pub points: Vec<[T; 3]>,
-    pub weights: Vec<T>,
-    pub bones: Vec<T>,
-    pub quats: Vec<[T; 4]>,
-    pub albedo: Vec<[T; 3]>,
-    pub shade: Vec<T>,
-}
-
-/// Gradients of all that was posed.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PoseGradients<T> {
-    /// In the order of the subjects.
-    pub subjects: Vec<SubjectGradients<T>>,
-    /// Of the clip's light.
-    pub clip: [[T; 3]; CLIP],
 }
 
 impl<'a, T: Vectors> Pose<'a, T> {
@@ -350,58 +320,6 @@ impl<'a, T: Vectors> Pose<'a, T> {
             subjects: gradients,
             clip,
         })
-    }
-}
-
-/// A subject's gradients from those of its chunks, summed in their order.
-fn joined<T: Vectors>(
-    chunks: &[&ChunkGradients<T>],
-    subject: &Subject<'_, T>,
-    frames: usize,
-    bones: &Bones<T>,
-    wanted: Wanted,
-) -> SubjectGradients<T> {
-    let mut out = SubjectGradients {
-        points: Vec::new(),
-        weights: Vec::new(),
-        bones: Vec::new(),
-        quats: Vec::new(),
-        albedo: Vec::new(),
-        shade: Vec::new(),
-    };
-    if wanted.points && subject.moves() {
-        out.points = vec![[T::ZERO; 3]; frames * subject.count];
-        let mut first = 0;
-        for chunk in chunks {
-            let len = chunk.points.len() / frames.max(1);
-            for frame in 0..frames {
-                out.points[frame * subject.count + first..][..len]
-                    .copy_from_slice(&chunk.points[frame * len..][..len]);
-            }
-            first += len;
-        }
-    }
-    if let (Some(light), true) = (subject.surface.and_then(|surface| surface.light), wanted.light) {
-        out.shade = vec![T::ZERO; light.shade.len()];
-    }
-    let mut v_bones: Vec<Bone<T>> = vec![[T::ZERO; 16]; if wanted.bones { frames * bones.count } else { 0 }];
-    for chunk in chunks {
-        if !subject.moves() {
-            out.points.extend_from_slice(&chunk.points);
-        }
-        out.weights.extend_from_slice(&chunk.weights);
-        out.quats.extend_from_slice(&chunk.quats);
-        out.albedo.extend_from_slice(&chunk.albedo);
-        add_all(&mut out.shade, &chunk.shade);
-        add_all(v_bones.as_flattened_mut(), chunk.bones.as_flattened());
-    }
-    out.bones = bones.vjp(&v_bones, subject.bone_size);
-    out
-}
-
-fn add_all<T: Vectors>(sums: &mut [T], values: &[T]) {
-    for (sum, &value) in sums.iter_mut().zip(values) {
-        *sum += value;
     }
 }
 
