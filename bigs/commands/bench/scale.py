@@ -104,7 +104,9 @@ def bench_scale(
             row["failure"] = failure
         else:
             row["times"] = done.times
-            row["bytes"] = read_json(run.folder / MEMORY)["bytes"]
+            held = run.folder / MEMORY
+            # Missing if the call that ran it was interrupted right then.
+            row["bytes"] = read_json(held)["bytes"] if held.exists() else None
         report["runs"].append(row)
         write_json(out / NUMBERS, report)
         table = _table(report)
@@ -182,7 +184,8 @@ def _table(report: dict[str, Any]) -> Table:
         ]
         whole = row["times"]["wall"]
         seconds = (f"{value:.0f}" for value in (whole, row["times"]["cpu"], *parts, whole - sum(parts)))
-        rows.append((*about, *seconds, f"{row['bytes'] / 2**30:.1f}"))
+        peak = "-" if row["bytes"] is None else f"{row['bytes'] / 2**30:.1f}"
+        rows.append((*about, *seconds, peak))
     return Table(
         "Frames and pixels",
         "The clip played to and fro and enlarged; each run in a process of its own, whose peak memory it is.",

@@ -63,15 +63,17 @@ def test_a_run_that_fails_does_not_lose_the_others(
     def fake(run: PlannedRun) -> FinishedRun:
         if run.folder.name.startswith("4"):
             return FinishedRun(failure="InputError: no light")
-        run.folder.mkdir(exist_ok=True)
         stage = {"wall": 2.0, "cpu": 3.0}
-        return FinishedRun(times={"wall": 4.0, "cpu": 6.0, "stages": {"joint": stage, "start values": stage}})
+        # Of an earlier call, which was interrupted before it wrote down the memory.
+        return FinishedRun(
+            reused=True, times={"wall": 4.0, "cpu": 6.0, "stages": {"joint": stage, "start values": stage}}
+        )
 
     monkeypatch.setattr(module, "Worker", Here)
     monkeypatch.setattr(module, "run_or_reuse", fake)
     table, failed = bench_scale(ScalePlan(tiny_clip, (4, 5), (0.25,), "smoke"), tmp_path)
     assert failed == ["4-frames-30x22"]
-    assert "no light" in table.rows[1][2] and table.rows[2][2:7] == ("4", "6", "2", "2", "0")
+    assert "no light" in table.rows[1][2] and table.rows[2][2:] == ("4", "6", "2", "2", "0", "-")
 
 
 def test_what_the_command_line_refuses(call: Callable[..., Answer], tiny_clip: Path, tmp_path: Path) -> None:
