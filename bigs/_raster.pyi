@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 from bigs.raster.settings import RasterSettings
 
 __all__ = [
-    "DistanceState",
     "RasterState",
     "SymmetryJudge",
+    "TouchState",
     "__version__",
     "beyond_planes",
     "cone_distances",
     "cut_patches",
     "default_settings",
-    "distances_backward",
-    "distances_forward",
+    "distances",
     "fma_peak_gflops",
     "harmonics_backward",
     "harmonics_forward",
@@ -37,6 +36,8 @@ __all__ = [
     "times_empty",
     "times_on",
     "times_seen",
+    "touch_backward",
+    "touch_forward",
     "tree_backward",
     "tree_forward",
 ]
@@ -218,20 +219,26 @@ def tree_backward(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Flat gradients of rotations, rest_joints and root from those of joints and bones."""
 
+def distances(arrays: tuple[NDArray[Any], NDArray[Any], NDArray[Any]]) -> NDArray[Any]:
+    """Flat distances of points [.., 3] from values [Z, Y, X] within bounds [2, 3]."""
+
 @final
-class DistanceState:
-    """What distances were measured and how they change. Opaque; usable any number of times."""
+class TouchState:
+    """What touches, for the backward pass. Opaque; usable any number of times."""
 
-# points [B, V, 3], rotations [B, 3, 3], centers [B, 3], scale [], values [Z, Y, X], bounds [2, 3].
-_Distances = tuple[NDArray[Any], ...]
+# points [V, 3] or [B, V, 3], weights [V, K], bones [B, K, 4, 4], rotations [B, 3, 3], centers [B, 3],
+# scale [], values [Z, Y, X], bounds [2, 3].
+_Touch = tuple[NDArray[Any], ...]
+# Whether the hand is mirrored, how many vertices count, and the tolerance.
+_TouchOptions = tuple[bool, int, float]
 
-def distances_forward(arrays: _Distances) -> tuple[NDArray[Any], DistanceState]:
-    """Flat distances [B, V]."""
+def touch_forward(arrays: _Touch, options: _TouchOptions) -> tuple[NDArray[Any], NDArray[Any], TouchState]:
+    """Depths [B] and sums of squares [B] of what is sunk."""
 
-def distances_backward(
-    state: DistanceState, arrays: _Distances, v_distances: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Flat gradients of points, rotations, centers and scale from those of the distances."""
+def touch_backward(
+    state: TouchState, arrays: _Touch, options: _TouchOptions, pulls: list[NDArray[Any] | None]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Flat gradients of points, bones, rotations, centers and scale from those of depths and sums."""
 
 # Focal lengths and principal point, rotations [T, 9], centres [T, 3].
 _Poses = tuple[tuple[float, float, float, float], NDArray[np.float64], NDArray[np.float64]]

@@ -24,14 +24,19 @@ def pose_twin(subjects: Sequence[Posing], clip: Tensor | None, labels: bool) -> 
     return means, quats, colors
 
 
+def blended(subject: Posing) -> Tensor:
+    """The centres [B, N, 3] alone."""
+    carried = torch.einsum("nk,bkij->bnij", subject.weights, subject.bones[:, :, :3])
+    means = (carried[..., :3] @ subject.points[..., None])[..., 0] + carried[..., 3]
+    return means * means.new_tensor([-1.0, 1.0, 1.0]) if subject.mirrored else means
+
+
 def posed(subject: Posing, clip: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    blended = torch.einsum("nk,bkij->bnij", subject.weights, subject.bones[:, :, :3])
-    means = (blended[..., :3] @ subject.points[..., None])[..., 0] + blended[..., 3]
+    means = blended(subject)
     bones = matrix_to_quat(subject.bones[:, :, :3, :3])
     bones = torch.where((bones * bones[:, :1]).sum(-1, keepdim=True) < 0, -bones, bones)
     quats = quat_multiply(torch.einsum("nk,bkq->bnq", subject.weights, bones), subject.quats)
     if subject.mirrored:
-        means = means * means.new_tensor([-1.0, 1.0, 1.0])
         # S R S for S = diag(-1, 1, 1).
         quats = quats * quats.new_tensor([1.0, 1.0, -1.0, -1.0])
     colors = subject.albedo.expand(*means.shape[:2], 3)

@@ -1,11 +1,13 @@
-"""A signed distance field on a grid, sampled with gradients."""
+"""A signed distance field on a grid."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from bigs.fused.distance import moving_distances
+from bigs.fused import touch as fused
+from bigs.fused.posing import Posing
+from bigs.fused.touch import Touch
 from bigs.geometry.surface import DistanceGrid
 
 
@@ -25,14 +27,17 @@ class DistanceField(nn.Module):
         self.register_buffer("bounds", torch.stack([lower, upper]), persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Signed distances [...] in metres of points [..., 3]; negative inside."""
-        still, nowhere = torch.eye(3).to(points)[None], points.new_zeros(1, 3)
-        flat = points.reshape(1, -1, 3)
-        return self.of_moving(flat, still, nowhere, points.new_ones(())).reshape(points.shape[:-1])
+        """Signed distances [...] in metres of points [..., 3]; negative inside. Without gradient."""
+        return fused.distances(points, self.values, self.bounds)
 
-    def of_moving(self, points: Tensor, rotations: Tensor, centers: Tensor, scale: Tensor) -> Tensor:
-        """Signed distances [B, V] of points [B, V, 3] from the object in B poses, in the points' unit.
-
-        The object's point p is at scale [] times rotation [B, 3, 3] times p, plus centre [B, 3].
-        """
-        return moving_distances(points, rotations, centers, scale, self.values, self.bounds)
+    def touch(
+        self,
+        hand: Posing,
+        rotations: Tensor,
+        centers: Tensor,
+        scale: Tensor,
+        deepest: int = 30,
+        tolerance: float = 0.001,
+    ) -> Touch:
+        """What of a hand touches the object in B poses; see `bigs.fused.touch.touch`."""
+        return fused.touch(hand, rotations, centers, scale, self.values, self.bounds, deepest, tolerance)

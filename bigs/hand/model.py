@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from bigs.checks import check_shape
+from bigs.fused.posing import Posing, skin
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from bigs.hand.lbs import forward_kinematics, pose_corrective, shape_vertices, skin_points
+from bigs.hand.lbs import forward_kinematics, pose_corrective, shape_vertices
 from bigs.hand.mirror import mirror_axis_angle, mirror_points
 from bigs.types import Side
 
@@ -157,11 +158,15 @@ class HandModel(nn.Module):
 
     def skin(self, skeleton: Skeleton, hand_pose: Tensor, vertices: Tensor | None = None) -> Tensor:
         """Vertices [T, V, 3] of a posed skeleton, or of some `vertices` (indices) only."""
+        return skin(self.posing(skeleton, hand_pose, vertices))
+
+    def posing(self, skeleton: Skeleton, hand_pose: Tensor, vertices: Tensor | None = None) -> Posing:
+        """The same before it is carried out: what carries vertices to their frames."""
         some = slice(None) if vertices is None else vertices
         rest = skeleton.shaped[..., some, :]
         if self.has_posedirs:
             rest = rest + pose_corrective(self.posedirs[some], hand_pose)
-        return skin_points(rest, self.lbs_weights[some], skeleton.bone_transforms)
+        return Posing(rest, self.lbs_weights[some], skeleton.bone_transforms)
 
     def pose_matrices(self, hand_pose_aa: Tensor) -> Tensor:
         """Finger rotations [..., 15, 3, 3] of mean-relative axis-angle [..., 15, 3] (flat_hand_mean=False).

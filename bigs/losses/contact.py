@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 
@@ -17,47 +16,36 @@ def center_contact(object_centers: Tensor, wrists: Tensor, touching: Tensor) -> 
     return (distance * touching).sum() / touching.sum().clamp_min(1.0)
 
 
-def deepest_mean(distances: Tensor, count: int) -> Tensor:
-    """Mean [B] of the `count` smallest signed values of `distances` [B, V].
-
-    Zero when the part of a hand that reaches furthest lies on the surface; the smallest *absolute* values
-    would also be near zero for a hand that is stuck deep inside, where some vertices always cross it.
-    """
-    return distances.topk(min(count, distances.shape[1]), dim=1, largest=False).values.mean(1)
-
-
-def surface_gaps(distances: Tensor, count: int = 30, reach: float = 0.01) -> Tensor:
+def surface_gaps(depths: Tensor, reach: float = 0.01) -> Tensor:
     """How far the part of a hand that reaches furthest is from the object's surface, [B] in [0, 1).
 
     |d| / (|d| + reach) of its mean distance d: it saturates, so that a frame whose pose is wrong altogether
     does not outweigh the rest.
 
     Args:
-        distances: [B, V] signed distances of the hand's vertices from the object, metres.
-        count: how many vertices count as the touching part.
+        depths: [B] mean of the least signed distances of the hand's vertices, metres. It is zero when that
+            part lies on the surface; the least *absolute* distances would also be near zero for a hand that
+            is stuck deep inside, where some vertices always cross it.
         reach: metres at which the pull has fallen by half.
     """
-    depth = deepest_mean(distances, count).abs()
-    return depth / (depth + reach)
+    away = depths.abs()
+    return away / (away + reach)
 
 
-def surface_contact(distances: Tensor, touching: Tensor, count: int = 30) -> Tensor:
+def surface_contact(depths: Tensor, touching: Tensor) -> Tensor:
     """Mean of `surface_gaps` over the frames that touch: draws the part that reaches furthest to the surface.
 
     Args:
-        distances: [B, V] signed distances of the hand's vertices from the object, metres.
+        depths: [B] see `surface_gaps`.
         touching: [B] in [0, 1], how sure it is that the hand touches the object.
-        count: see `surface_gaps`.
     """
-    return (surface_gaps(distances, count) * touching).sum() / touching.sum().clamp_min(1.0)
+    return (surface_gaps(depths) * touching).sum() / touching.sum().clamp_min(1.0)
 
 
-def penetration(distances: Tensor, tolerance: float = 0.001) -> Tensor:
-    """Sum over vertices of max(-d - tolerance, 0)^2, a mean over frames, in centimetres squared.
+def penetration(sunk: Tensor) -> Tensor:
+    """Squared depth of what is inside the object, a mean over frames, in centimetres squared.
 
     Args:
-        distances: [B, V] signed distances d of the hand's vertices from the object, metres; negative inside.
-        tolerance: depth in metres that costs nothing.
+        sunk: [B] sum over the hand's vertices of their squared depths, metres squared.
     """
-    depth = 100.0 * torch.relu(-distances - tolerance)
-    return depth.square().sum(1).mean()
+    return 1e4 * sunk.mean()

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from bigs.fused.posing import Posing, skin
+from bigs.fused.touch import Touch
 from bigs.hand import Skeleton, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.hand_splats import pose_splats, rest_points
@@ -63,13 +65,14 @@ class PosedScene:
 
     def verts(self, side: Side) -> Tensor:
         """Vertices [B, V, 3] of a hand in camera space, metres."""
-        return self._skinned(side, None)
+        return skin(self.posing(side))
 
     def joints(self, side: Side) -> Tensor:
         """The 21 joints [B, 21, 3] of a hand in camera space, metres."""
         joints = self._skeleton(side).joints
         joints = mirror_points(joints) if side == "left" else joints
-        return torch.cat([joints, self._skinned(side, self._scene.hand_model(side).tip_vertex_ids)], dim=1)
+        tips = self.posing(side, self._scene.hand_model(side).tip_vertex_ids)
+        return torch.cat([joints, skin(tips)], dim=1)
 
     def object_points(self, points: Tensor) -> Tensor:
         """Points [N, 3] of the object's own frame in camera space: [B, N, 3]."""
@@ -81,9 +84,15 @@ class PosedScene:
         pose = self.object
         return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
-    def object_distances(self, points: Tensor) -> Tensor:
-        """Signed distances [B, N] of camera points [B, N, 3] from the object's surface, metres."""
-        return self._scene.object_distance.of_moving(points, *self.object)
+    def touch(self, side: Side) -> Touch:
+        """What of a hand touches the object's surface, metres."""
+        return self._scene.object_distance.touch(self.posing(side), *self.object)
+
+    def posing(self, side: Side, vertices: Tensor | None = None) -> Posing:
+        """What carries a hand's vertices, or some of them (indices), to camera space."""
+        skeleton, pose = self._skeleton(side), self.hand(side).hand_pose
+        posing = self._scene.hand_model(side).posing(skeleton, pose, vertices)
+        return posing._replace(mirrored=side == "left")
 
     def posed(
         self, canonical: Mapping[Entity, CanonicalHand | CanonicalObject], labels: bool = False
@@ -111,11 +120,6 @@ class PosedScene:
         if lighting is None:
             return part
         return part.lit(canonical.weights, lighting.shade[entity][self.frames])
-
-    def _skinned(self, side: Side, vertices: Tensor | None) -> Tensor:
-        skeleton, pose = self._skeleton(side), self.hand(side).hand_pose
-        verts = self._scene.hand_model(side).skin(skeleton, pose, vertices)
-        return mirror_points(verts) if side == "left" else verts
 
     def _own_hand(self, side: Side) -> HandFrames:
         poses, grasps = self._scene.hand_poses[side], self._scene.grasps[side]

@@ -55,13 +55,15 @@ def search_object_scale(
     factors = torch.linspace(1.0 - stage.span, 1.0 + stage.span, stage.candidates)
     start = scene.object_poses.log_scale.clone()
     frames = torch.arange(scene.n_frames)
-    hands = {side: scene.at(frames).verts(side) for side in scene.sides}
+    # Hands stay where they are, though a grasp would carry them along.
+    hands = {side: scene.at(frames).posing(side) for side in scene.sides}
     gaps = {side: torch.zeros(len(factors), scene.n_frames) for side in hands}
     hidden = torch.zeros(len(factors))
     for c, factor in enumerate(factors):
         scene.object_poses.log_scale.copy_(start + factor.log())
-        for side, verts in hands.items():
-            gaps[side][c] = surface_gaps(scene.at(frames).object_distances(verts))
+        carrier = scene.object_poses(frames)
+        for side, hand in hands.items():
+            gaps[side][c] = surface_gaps(scene.object_distance.touch(hand, *carrier).depths)
         hidden[c] = stage.labels_weight * occlusion()
     scene.object_poses.log_scale.copy_(start)
     costs = _costs(gaps, touching) + hidden

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
+from bigs.fused.touch import Touch
 from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand, CanonicalObject
@@ -223,11 +224,9 @@ class Step:
         return {side: self.posed_clip.joints(side) for side in self.scene.sides}
 
     @cached_property
-    def object_distances(self) -> dict[Side, Tensor]:
-        """Signed distance [T, V] in metres of each hand's vertices from the object's surface."""
-        return {
-            side: self.posed_clip.object_distances(self.posed_clip.verts(side)) for side in self.scene.sides
-        }
+    def touches(self) -> dict[Side, Touch]:
+        """What of each hand touches the object in every frame of the clip."""
+        return {side: self.posed_clip.touch(side) for side in self.scene.sides}
 
     @property
     def has_object(self) -> bool:

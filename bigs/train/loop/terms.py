@@ -298,8 +298,7 @@ def contact(step: Step) -> Tensor:
             for side, joints in step.joints.items()
         )
     return _mean(
-        surface_contact(distances, step.evidence.touching[side])
-        for side, distances in step.object_distances.items()
+        surface_contact(touch.depths, step.evidence.touching[side]) for side, touch in step.touches.items()
     )
 
 
@@ -307,7 +306,7 @@ def penetrating(step: Step) -> Tensor:
     """Squared depth of hand vertices inside the object, in centimetres beyond a millimetre."""
     if not step.has_object:
         return torch.zeros(())
-    return _mean(penetration(distances) for distances in step.object_distances.values())
+    return _mean(penetration(touch.sunk) for touch in step.touches.values())
 
 
 @dataclass(frozen=True)

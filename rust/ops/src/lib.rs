@@ -24,5 +24,6 @@ pub mod joints;
 mod lanes;
 pub mod pixels;
 pub mod pose;
+pub mod touch;
 
 pub use bigs_raster::RasterError as OpsError;

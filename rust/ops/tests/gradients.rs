@@ -1,6 +1,5 @@
-//! Gradients of pictures' terms, joint trees and distances against finite differences, and refusals.
+//! Gradients of pictures' terms, and joint trees against finite differences, and refusals.
 
-use bigs_ops::distance::{Distances, Grid};
 use bigs_ops::joints::{Tree, rotations, rotations_vjp};
 use bigs_ops::pixels::{Frames, alone::Alone, together::Together};
 
@@ -196,56 +195,4 @@ fn joint_trees() {
         root: threes(&root[..3]),
     };
     assert!(backwards.pose().unwrap_err().to_string().starts_with("parents"));
-}
-
-#[test]
-fn distances_from_an_object_that_moves() {
-    let values = random(1, 4 * 5 * 6);
-    let grid = Grid {
-        values: &values,
-        size: [6, 5, 4],
-        bounds: [[-1.0, -1.2, -0.8], [1.1, 1.0, 0.9]],
-    };
-    let turns = rotations(threes(&random(2, 6))).as_flattened().to_vec();
-    let centers = random(3, 6);
-    // Inside the grid and out of it.
-    let points: Vec<f64> = random(4, 60).iter().map(|v| 4.0 * v - 1.5).collect();
-    let v = random(5, 20);
-    let with = |points: &[f64], turns: &[f64], centers: &[f64], scale: f64| {
-        let distances = Distances {
-            grid,
-            points: threes(points),
-            rotations: nines(turns),
-            centers: threes(centers),
-            scale,
-        };
-        let measured = distances.measure().unwrap();
-        let loss = dot(&measured.distances, &v);
-        (loss, distances.vjp(&measured, &v).unwrap())
-    };
-    let (_, found) = with(&points, &turns, &centers, 1.3);
-    check("points", found.points.as_flattened(), &|i, h| {
-        with(&changed(&points, i, h), &turns, &centers, 1.3).0
-    });
-    check("rotations", found.rotations.as_flattened(), &|i, h| {
-        with(&points, &changed(&turns, i, h), &centers, 1.3).0
-    });
-    check("centers", found.centers.as_flattened(), &|i, h| {
-        with(&points, &turns, &changed(&centers, i, h), 1.3).0
-    });
-    check("scale", &[found.scale], &|_, h| {
-        with(&points, &turns, &centers, 1.3 + h).0
-    });
-    let flat = Grid {
-        size: [120, 1, 1],
-        ..grid
-    };
-    let refused = Distances {
-        grid: flat,
-        points: threes(&points),
-        rotations: nines(&turns),
-        centers: threes(&centers),
-        scale: 1.0,
-    };
-    assert!(refused.measure().unwrap_err().to_string().starts_with("values"));
 }

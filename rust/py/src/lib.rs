@@ -8,6 +8,7 @@ mod pose;
 mod poses;
 mod sh;
 mod shape;
+mod touch;
 mod track;
 
 use bigs_raster::{Batch, BatchState, CameraModel, RasterError, RasterSettings, RenderMode, Wanted};
@@ -320,13 +321,14 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sh::harmonics_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_forward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_backward, m)?)?;
-    m.add_class::<poses::DistanceState>()?;
+    m.add_class::<touch::TouchState>()?;
     m.add_function(wrap_pyfunction!(poses::rotations_forward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::rotations_backward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_forward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_backward, m)?)?;
-    m.add_function(wrap_pyfunction!(poses::distances_forward, m)?)?;
-    m.add_function(wrap_pyfunction!(poses::distances_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(touch::distances, m)?)?;
+    m.add_function(wrap_pyfunction!(touch::touch_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(touch::touch_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone, m)?)?;

@@ -1,6 +1,5 @@
-//! Joint trees and distances from the object: the Python face of `bigs_ops::joints` and `bigs_ops::distance`.
+//! Rotations and joint trees: the Python face of `bigs_ops::joints`.
 
-use bigs_ops::distance::{Distances, Grid, Measured};
 use bigs_ops::joints::{Tree, rotations, rotations_vjp};
 use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -12,7 +11,7 @@ use crate::convert::{contiguous, gradient, is_single, rows, slice};
 use crate::run;
 
 /// N named arrays of a tuple, borrowed for as long as this lives.
-fn held<'py, T: Element, const N: usize>(
+pub(crate) fn held<'py, T: Element, const N: usize>(
     names: [&str; N],
     arrays: &Bound<'py, PyTuple>,
 ) -> PyResult<[PyReadonlyArrayDyn<'py, T>; N]> {
@@ -27,7 +26,7 @@ fn held<'py, T: Element, const N: usize>(
 }
 
 /// The values of an array in rows of D, whatever its last axes are.
-fn records<'a, U: Element, const D: usize>(
+pub(crate) fn records<'a, U: Element, const D: usize>(
     name: &str,
     array: &'a PyReadonlyArrayDyn<'_, U>,
 ) -> PyResult<&'a [[U; D]]> {
@@ -153,105 +152,5 @@ pub(crate) fn tree_backward<'py>(
         pose_tree_back::<f32>(py, arrays, &parents, pulls)
     } else {
         pose_tree_back::<f64>(py, arrays, &parents, pulls)
-    }
-}
-
-/// What distances were measured and how they change. Opaque; usable any number of times.
-#[pyclass(frozen, module = "bigs._raster")]
-pub(crate) struct DistanceState {
-    kept: Kept,
-}
-
-enum Kept {
-    Single(Measured<f32>),
-    Double(Measured<f64>),
-}
-
-const DISTANCE: [&str; 6] = ["points", "rotations", "centers", "scale", "values", "bounds"];
-
-fn distances_of<'a, T: Kind>(
-    [points, rotations, centers, scale, values, bounds]: &'a [PyReadonlyArrayDyn<'_, T>; 6],
-) -> PyResult<Distances<'a, T>> {
-    let (&[lower, upper], &[scale]) = (rows("bounds", bounds)?, contiguous("scale", scale)?) else {
-        return Err(PyValueError::new_err(
-            "bounds: expected two rows, and of scale one value",
-        ));
-    };
-    let &[z, y, x] = values.shape() else {
-        return Err(PyValueError::new_err(format!(
-            "values: expected three axes, found shape {:?}",
-            values.shape()
-        )));
-    };
-    Ok(Distances {
-        grid: Grid {
-            values: contiguous("values", values)?,
-            size: [x, y, z],
-            bounds: [lower, upper],
-        },
-        points: rows("points", points)?,
-        rotations: records("rotations", rotations)?,
-        centers: rows("centers", centers)?,
-        scale,
-    })
-}
-
-/// Flat distances `[B, V]` and a state for the backward pass.
-///
-/// `arrays` is (points `[B, V, 3]`, rotations `[B, 3, 3]`, centers `[B, 3]`, scale `[]`, values `[Z, Y, X]`, bounds `[2, 3]`),
-/// C-contiguous, float32 or float64 throughout. Raises ValueError.
-#[pyfunction]
-pub(crate) fn distances_forward<'py>(
-    py: Python<'py>,
-    arrays: &Bound<'py, PyTuple>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    if is_single(arrays) {
-        let arrays = held::<f32, 6>(DISTANCE, arrays)?;
-        let distances = distances_of(&arrays)?;
-        let found = run(py, || distances.measure())?;
-        let flat = gradient(py, found.distances.clone());
-        let kept = Kept::Single(found);
-        (flat, DistanceState { kept }).into_pyobject(py)
-    } else {
-        let arrays = held::<f64, 6>(DISTANCE, arrays)?;
-        let distances = distances_of(&arrays)?;
-        let found = run(py, || distances.measure())?;
-        let flat = gradient(py, found.distances.clone());
-        let kept = Kept::Double(found);
-        (flat, DistanceState { kept }).into_pyobject(py)
-    }
-}
-
-fn distances_back<'py, T: Kind>(
-    py: Python<'py>,
-    measured: &Measured<T>,
-    arrays: &Bound<'py, PyTuple>,
-    v: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    let arrays = held::<T, 6>(DISTANCE, arrays)?;
-    let distances = distances_of(&arrays)?;
-    let v = slice::<T>("v_distances", v)?;
-    let v = contiguous("v_distances", &v)?;
-    let found = run(py, || distances.vjp(measured, v))?;
-    (
-        gradient(py, found.points.into_flattened()),
-        gradient(py, found.rotations.into_flattened()),
-        gradient(py, found.centers.into_flattened()),
-        gradient(py, vec![found.scale]),
-    )
-        .into_pyobject(py)
-}
-
-/// Flat gradients of points, rotations, centers and scale from those of the distances.
-#[pyfunction]
-pub(crate) fn distances_backward<'py>(
-    py: Python<'py>,
-    state: &Bound<'py, DistanceState>,
-    arrays: &Bound<'py, PyTuple>,
-    v_distances: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    match &state.get().kept {
-        Kept::Single(measured) => distances_back(py, measured, arrays, v_distances),
-        Kept::Double(measured) => distances_back(py, measured, arrays, v_distances),
     }
 }
