@@ -18,6 +18,8 @@ __all__ = [
     "default_settings",
     "distances",
     "fma_peak_gflops",
+    "hand_poses_backward",
+    "hand_poses_forward",
     "harmonics_backward",
     "harmonics_forward",
     "lay_patches",
@@ -208,6 +210,23 @@ def rotations_forward(arrays: tuple[NDArray[Any]]) -> NDArray[Any]:
 def rotations_backward(arrays: tuple[NDArray[Any], NDArray[Any]]) -> NDArray[Any]:
     """Flat gradients of vectors [.., 3] from those of their matrices [.., 3, 3]."""
 
+# base_orient [T, 3, 3], base_pose [T, J, 3, 3], base_ray [T, 2], base_log_depth [T], orient [T, 3],
+# pose [T, J, 3], pose_bias [J, 3], ray [T, 2], log_depth [T].
+_HandPoses = tuple[NDArray[Any], ...]
+# None, or (base_orient [G, 3, 3], base_pose [G, J, 3, 3], base_position [G, 3], orient [G, 3],
+# pose [G, J, 3], position [G, 3], rotations [B, 3, 3], centers [B, 3], scale []), of_frame [T], slack, mirrored.
+_Carried = tuple[tuple[NDArray[Any], ...], NDArray[np.int64], float, bool] | None
+
+def hand_poses_forward(
+    arrays: _HandPoses, frames: list[int], carried: _Carried
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Flat rotations [B, 3, 3] and [B, J, 3, 3] and wrists [B, 3] of some of T frames."""
+
+def hand_poses_backward(
+    arrays: _HandPoses, frames: list[int], carried: _Carried, pulls: list[NDArray[Any] | None]
+) -> tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...] | None]:
+    """Flat gradients of what was learned of frames, and of grasps and what carries them."""
+
 # rotations [B, K, 3, 3], rest_joints [K, 3] or [B, K, 3], root [B, 3].
 _Tree = tuple[NDArray[Any], ...]
 
@@ -219,7 +238,7 @@ def tree_backward(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Flat gradients of rotations, rest_joints and root from those of joints and bones."""
 
-def distances(arrays: tuple[NDArray[Any], NDArray[Any], NDArray[Any]]) -> NDArray[Any]:
+def distances(arrays: tuple[NDArray[Any], ...]) -> NDArray[Any]:
     """Flat distances of points [.., 3] from values [Z, Y, X] within bounds [2, 3]."""
 
 @final

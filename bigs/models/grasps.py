@@ -10,7 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation
+from bigs.fused.hand_poses import Carried
+from bigs.geometry.rotations import robust_mean_rotation
 from bigs.hand import mirror_rotation
 from bigs.models.poses import HandFrames, ObjectFrames
 
@@ -59,16 +60,21 @@ class Grasps(nn.Module):
         grasped = self.of_frame >= 0
         return self.pose[self.of_frame.clamp_min(0)] * grasped[:, None, None]
 
-    def forward(self, frames: Tensor, object_frames: ObjectFrames) -> HandFrames:
-        """The hand's poses at `frames` [B] as the object carries it; meaningless outside grasps."""
-        g = self.of_frame[frames].clamp_min(0)
-        orient = axis_angle_to_matrix(self.orient[g]) @ self.base_orient[g]
-        position = self.base_position[g] + self.position[g]
-        return HandFrames(
-            self._seen(object_frames.rotations) @ orient,
-            self.base_pose[g] @ axis_angle_to_matrix(self.pose[g]),
-            object_frames.scale * (object_frames.rotations @ position[..., None])[..., 0]
-            + object_frames.centers,
+    def forward(self, object_frames: ObjectFrames) -> Carried | None:
+        """What carries the hand in the frames of `object_frames`; None if there are no grasps."""
+        if not self.count:
+            return None
+        return Carried(
+            self.base_orient,
+            self.base_pose,
+            self.base_position,
+            self.orient,
+            self.pose,
+            self.position,
+            *object_frames,
+            self.of_frame,
+            float(self.slack),
+            self.mirrored,
         )
 
     @torch.no_grad()
@@ -94,7 +100,10 @@ class Grasps(nn.Module):
         self.of_frame.copy_(of_frame)
         self.slack.fill_(slack)
         self.certainty.copy_((of_frame >= 0).to(self.certainty) if certainty is None else certainty)
-        orient = self._seen(object_frames.rotations).transpose(-1, -2) @ hand.global_orient
+        seen = object_frames.rotations
+        if self.mirrored:
+            seen = mirror_rotation(seen)
+        orient = seen.transpose(-1, -2) @ hand.global_orient
         away = (hand.wrist - object_frames.centers)[..., None]
         position = (object_frames.rotations.transpose(-1, -2) @ away)[..., 0] / object_frames.scale
         for g in range(self.count):
@@ -102,6 +111,3 @@ class Grasps(nn.Module):
             self.base_orient[g] = robust_mean_rotation(orient[own])
             self.base_pose[g] = robust_mean_rotation(hand.hand_pose[own].transpose(0, 1))
             self.base_position[g] = position[own].median(0).values
-
-    def _seen(self, rotations: Tensor) -> Tensor:
-        return mirror_rotation(rotations) if self.mirrored else rotations

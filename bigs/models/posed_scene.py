@@ -123,15 +123,8 @@ class PosedScene:
 
     def _own_hand(self, side: Side) -> HandFrames:
         poses, grasps = self._scene.hand_poses[side], self._scene.grasps[side]
-        grasped = grasps.covers(self.frames)
-        if not grasped.any():
-            return poses(self.frames)
-        carried, own = grasps(self.frames, self.object), poses.start(self.frames)
-        start = (
-            torch.where(grasped.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-            for a, b in zip(carried, own, strict=True)
-        )
-        return poses(self.frames, HandFrames(*start), torch.where(grasped, grasps.slack, 1.0))
+        grasped = grasps.covers(self.frames).any()
+        return poses(self.frames, grasps(self.object) if grasped else None)
 
     def _skeleton(self, side: Side) -> Skeleton:
         """The canonical hand's bones."""

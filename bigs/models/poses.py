@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from bigs.fused.hand_poses import Carried, Learned, hand_poses
 from bigs.geometry.rotations import axis_angle_to_matrix
 
 
@@ -45,33 +46,16 @@ class RayPositions(nn.Module):
         self.ray = nn.Parameter(torch.zeros(frames, 2))
         self.log_depth = nn.Parameter(torch.zeros(frames))
 
-    def start(self, frames: Tensor) -> Tensor:
-        """The positions [B, 3] that the residuals of `frames` [B] start from."""
-        depth = self.base_log_depth[frames].exp()[:, None]
-        return torch.cat([self.base_ray[frames] * depth, depth], dim=-1)
+    def forward(self, frames: Tensor, ray_freedom: Tensor | None = None) -> Tensor:
+        """Positions [B, 3] of `frames` [B].
 
-    def forward(
-        self,
-        frames: Tensor,
-        start: Tensor | None = None,
-        freedom: Tensor | None = None,
-        ray_freedom: Tensor | None = None,
-    ) -> Tensor:
-        """Positions [B, 3] of `frames` [B]; for `start` and `freedom` [B] see `HandPoses.forward`.
-
-        `ray_freedom` [B] does the same for the rays alone.
+        `ray_freedom` [B] is what residuals of rays are multiplied by, 1 if not given.
         """
-        ray, log_depth = self.ray[frames], self.log_depth[frames]
+        ray = self.ray[frames]
         if ray_freedom is not None:
             ray = ray_freedom[:, None] * ray
-        if freedom is not None:
-            ray, log_depth = freedom[:, None] * ray, freedom * log_depth
-        if start is None:
-            start_ray, start_log_depth = self.base_ray[frames], self.base_log_depth[frames]
-        else:
-            start_ray, start_log_depth = start[:, :2] / start[:, 2:], start[:, 2].log()
-        depth = torch.exp(start_log_depth + log_depth)
-        return torch.cat([(start_ray + ray) * depth[:, None], depth[:, None]], dim=-1)
+        depth = torch.exp(self.base_log_depth[frames] + self.log_depth[frames])
+        return torch.cat([(self.base_ray[frames] + ray) * depth[:, None], depth[:, None]], dim=-1)
 
     @torch.no_grad()
     def restart(self, positions: Tensor) -> None:
@@ -110,29 +94,25 @@ class HandPoses(nn.Module):
         self.pose_bias = nn.Parameter(torch.zeros(15, 3))
         self.position = RayPositions(wrist)
 
-    def start(self, frames: Tensor) -> HandFrames:
-        """The poses that the residuals of `frames` [B] start from."""
-        return HandFrames(self.base_orient[frames], self.base_pose[frames], self.position.start(frames))
-
-    def forward(
-        self, frames: Tensor, start: HandFrames | None = None, freedom: Tensor | None = None
-    ) -> HandFrames:
+    def forward(self, frames: Tensor, carried: Carried | None = None) -> HandFrames:
         """The poses of `frames` [B] (integer indices).
 
-        Args:
-            frames: [B].
-            start: what the residuals start from instead of the module's own start.
-            freedom: [B] what the residuals are multiplied by: how far a frame may leave its start.
+        In frames of a grasp, if there are any, `carried` gives the poses that residuals start from instead of
+        the module's own; see `bigs.fused.hand_poses`.
         """
-        orient, pose = self.orient[frames], self.pose[frames] + self.pose_bias
-        if freedom is not None:
-            orient, pose = freedom[:, None] * orient, freedom[:, None, None] * pose
-        base = self.start(frames) if start is None else start
-        return HandFrames(
-            axis_angle_to_matrix(orient) @ base.global_orient,
-            base.hand_pose @ axis_angle_to_matrix(pose),
-            self.position(frames, None if start is None else start.wrist, freedom),
+        position = self.position
+        learned = Learned(
+            self.base_orient,
+            self.base_pose,
+            position.base_ray,
+            position.base_log_depth,
+            self.orient,
+            self.pose,
+            self.pose_bias,
+            position.ray,
+            position.log_depth,
         )
+        return HandFrames(*hand_poses(frames, learned, carried))
 
     @torch.no_grad()
     def restart(self, poses: HandFrames) -> None:

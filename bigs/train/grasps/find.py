@@ -13,7 +13,7 @@ from torch import Tensor
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from bigs.hand import mirror_rotation
 from bigs.models.grasps import Grasps
-from bigs.models.poses import HandFrames, ObjectFrames
+from bigs.models.poses import HandFrames, HandPoses, ObjectFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.search import (
     Prices,
@@ -191,7 +191,7 @@ def _excess(
     of_frame[frames.start : frames.stop] = 0
     grasp.set(of_frame, 0.0, poses, carrier)
     grasp.of_frame.zero_()
-    carried = mismatch(side, grasp(torch.arange(count), carrier))
+    carried = mismatch(side, HandPoses(*poses)(torch.arange(count), grasp(carrier)))
     return torch.nan_to_num(carried - usual, nan=0.0).double().numpy()
 
 

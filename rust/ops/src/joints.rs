@@ -5,53 +5,14 @@ use rayon::prelude::*;
 
 use crate::OpsError;
 use crate::checks::check_length;
-
-type Vec3<T> = [T; 3];
-type Mat3<T> = [[T; 3]; 3];
-
-/// Below this angle quotients of small differences are read off their series.
-const SMALL: f64 = 0.05;
-
-/// sin θ / θ and (1 − cos θ) / θ², and the derivatives of both by θ over θ.
-fn bends(squared: f64) -> [f64; 4] {
-    let angle = squared.sqrt();
-    if angle < SMALL {
-        let s = squared;
-        return [
-            1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0)),
-            0.5 - s / 24.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0)),
-            -1.0 / 3.0 + s / 30.0 * (1.0 - s / 28.0 * (1.0 - s / 54.0)),
-            -1.0 / 12.0 + s / 180.0 * (1.0 - s / 37.333_333_333_333_336 * (1.0 - s / 67.5)),
-        ];
-    }
-    let (sin, cos) = angle.sin_cos();
-    let (a, b) = (sin / angle, (1.0 - cos) / squared);
-    [a, b, (cos - a) / squared, (a - 2.0 * b) / squared]
-}
+use crate::mat3::{
+    Mat3, Vec3, add, add_outer, apply, flat, matrix, minus, product, rotation, rotation_vjp, transposed,
+};
 
 /// Matrices, row by row, of rotation vectors in radians (Rodrigues' formula).
 #[must_use]
 pub fn rotations<T: Real>(vectors: &[[T; 3]]) -> Vec<[T; 9]> {
-    vectors
-        .iter()
-        .map(|vector| {
-            let [x, y, z] = vector.map(T::as_f64);
-            let [a, b, ..] = bends(x * x + y * y + z * z);
-            let diagonal = |p: f64, q: f64| 1.0 - b * (p * p + q * q);
-            [
-                diagonal(y, z),
-                b * x * y - a * z,
-                b * x * z + a * y,
-                b * x * y + a * z,
-                diagonal(x, z),
-                b * y * z - a * x,
-                b * x * z - a * y,
-                b * y * z + a * x,
-                diagonal(x, y),
-            ]
-            .map(T::of)
-        })
-        .collect()
+    vectors.iter().map(|&vector| flat(&rotation(vector))).collect()
 }
 
 /// Gradients of the vectors from those of the matrices.
@@ -60,27 +21,10 @@ pub fn rotations<T: Real>(vectors: &[[T; 3]]) -> Vec<[T; 9]> {
 /// Another number of gradients than vectors.
 pub fn rotations_vjp<T: Real>(vectors: &[[T; 3]], v: &[[T; 9]]) -> Result<Vec<[T; 3]>, OpsError> {
     check_length("v_matrices", vectors.len(), v.len())?;
-    let each = vectors.iter().zip(v).map(|(vector, v)| {
-        let [x, y, z] = vector.map(T::as_f64);
-        let v = v.map(T::as_f64);
-        let [a, b, da, db] = bends(x * x + y * y + z * z);
-        // Of the two factors, which depend on the length alone.
-        let (px, py, pz) = (v[7] - v[5], v[2] - v[6], v[3] - v[1]);
-        let v_a = x * px + y * py + z * pz;
-        let (xy, xz, yz) = (v[1] + v[3], v[2] + v[6], v[5] + v[7]);
-        let v_b = x * y * xy + x * z * xz + y * z * yz
-            - v[0] * (y * y + z * z)
-            - v[4] * (x * x + z * z)
-            - v[8] * (x * x + y * y);
-        let along = v_a * da + v_b * db;
-        [
-            x * along + a * px + b * (y * xy + z * xz - 2.0 * x * (v[4] + v[8])),
-            y * along + a * py + b * (x * xy + z * yz - 2.0 * y * (v[0] + v[8])),
-            z * along + a * pz + b * (x * xz + y * yz - 2.0 * z * (v[0] + v[4])),
-        ]
-        .map(T::of)
-    });
-    Ok(each.collect())
+    let each = vectors.iter().zip(v);
+    Ok(each
+        .map(|(&vector, v)| rotation_vjp(vector, &matrix(v)))
+        .collect())
 }
 
 /// A tree of K joints in B frames.
@@ -111,42 +55,6 @@ pub struct TreeGradients<T> {
     pub rotations: Vec<[T; 9]>,
     pub rest: Vec<[T; 3]>,
     pub root: Vec<[T; 3]>,
-}
-
-fn matrix<T: Real>(flat: &[T; 9]) -> Mat3<T> {
-    let [a, b, c, d, e, f, g, h, i] = *flat;
-    [[a, b, c], [d, e, f], [g, h, i]]
-}
-
-fn product<T: Real>(a: &Mat3<T>, b: &Mat3<T>) -> Mat3<T> {
-    a.map(|row| [0, 1, 2].map(|j| row[0] * b[0][j] + row[1] * b[1][j] + row[2] * b[2][j]))
-}
-
-fn transposed<T: Real>(a: &Mat3<T>) -> Mat3<T> {
-    [0, 1, 2].map(|i| [a[0][i], a[1][i], a[2][i]])
-}
-
-fn apply<T: Real>(a: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
-    a.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
-}
-
-fn minus<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
-    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
-}
-
-fn add<T: Real>(sum: &mut Vec3<T>, v: Vec3<T>) {
-    for i in 0..3 {
-        sum[i] += v[i];
-    }
-}
-
-/// Adds factor · a ⊗ b.
-fn add_outer<T: Real>(sum: &mut Mat3<T>, factor: T, a: Vec3<T>, b: Vec3<T>) {
-    for i in 0..3 {
-        for j in 0..3 {
-            sum[i][j] += factor * a[i] * b[j];
-        }
-    }
 }
 
 impl<T: Real> Tree<'_, T> {

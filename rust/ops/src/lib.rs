@@ -20,8 +20,10 @@
 
 mod checks;
 pub mod distance;
+pub mod hand_poses;
 pub mod joints;
 mod lanes;
+mod mat3;
 pub mod pixels;
 pub mod pose;
 pub mod touch;

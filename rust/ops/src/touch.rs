@@ -4,12 +4,13 @@
 
 use std::cmp::Ordering;
 
-use bigs_raster::{Real, Vectors};
+use bigs_raster::Vectors;
 use rayon::prelude::*;
 
 use crate::OpsError;
 use crate::checks::check_length;
 use crate::distance::{Grid, Sampler};
+use crate::mat3::add;
 use crate::pose::{Pose, Subject};
 
 /// An object's surface and its pose in each of B frames: x = scale · R p + centre.
@@ -301,11 +302,5 @@ impl<'a, T: Vectors> Touch<'a, T> {
             out.points.push((at.vertex, v_rest));
         }
         out
-    }
-}
-
-fn add<T: Real>(sum: &mut [T; 3], v: [T; 3]) {
-    for i in 0..3 {
-        sum[i] += v[i];
     }
 }

@@ -2,6 +2,7 @@
 
 mod call;
 mod convert;
+mod hand_poses;
 mod measure;
 mod pixels;
 mod pose;
@@ -322,6 +323,8 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(pose::pose_forward, m)?)?;
     m.add_function(wrap_pyfunction!(pose::pose_backward, m)?)?;
     m.add_class::<touch::TouchState>()?;
+    m.add_function(wrap_pyfunction!(hand_poses::hand_poses_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(hand_poses::hand_poses_backward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::rotations_forward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::rotations_backward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_forward, m)?)?;
