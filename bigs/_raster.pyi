@@ -214,7 +214,8 @@ def rotations_backward(arrays: tuple[NDArray[Any], NDArray[Any]]) -> NDArray[Any
 # pose [T, J, 3], pose_bias [J, 3], ray [T, 2], log_depth [T].
 _HandPoses = tuple[NDArray[Any], ...]
 # None, or (base_orient [G, 3, 3], base_pose [G, J, 3, 3], base_position [G, 3], orient [G, 3],
-# pose [G, J, 3], position [G, 3], rotations [B, 3, 3], centers [B, 3], scale []), of_frame [T], slack, mirrored.
+# pose [G, J, 3], position [G, 3], rotations [B, 3, 3], centers [B, 3], scale []), of_frame [T], slack and
+# whether the hand is mirrored.
 _Carried = tuple[tuple[NDArray[Any], ...], NDArray[np.int64], float, bool] | None
 
 def hand_poses_forward(

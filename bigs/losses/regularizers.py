@@ -12,7 +12,7 @@ def color_spread(colors: Tensor) -> Tensor:
 
 def scale_size(scales: Tensor) -> Tensor:
     """Mean over N Gaussians of ||s||^2 for standard deviations s [N, 3], metres (paper's L_scale, Eq. 5)."""
-    return scales.square().mean(0).sum()
+    return scales.square().sum() / len(scales)
 
 
 def lbs_deviation(weights: Tensor, target: Tensor) -> Tensor:
@@ -22,11 +22,12 @@ def lbs_deviation(weights: Tensor, target: Tensor) -> Tensor:
 
 def squared_norm(residuals: Tensor) -> Tensor:
     """Mean of ||r||^2 over residuals r [..., D], in their own unit squared: a normal prior around zero."""
-    return residuals.square().sum(-1).mean()
+    return residuals.square().sum() * (residuals.shape[-1] / residuals.numel())
 
 
-# Joints of index, middle, ring and pinky, in their order across the hand, and in that of MANO's pose.
-_FINGERS = ((0, 1, 2), (3, 4, 5), (9, 10, 11), (6, 7, 8))
+# Second differences across the hand, index to ring and middle to pinky, of MANO's fingers: index, middle,
+# pinky, ring and thumb.
+_ACROSS = ((1.0, -2.0, 0.0, 1.0, 0.0), (0.0, 1.0, 1.0, -2.0, 0.0))
 
 
 def finger_unevenness(hand_pose: Tensor) -> Tensor:
@@ -38,6 +39,6 @@ def finger_unevenness(hand_pose: Tensor) -> Tensor:
     Args:
         hand_pose: rotations [T, 15, 3, 3] in MANO's joint order.
     """
-    fingers = hand_pose[:, [list(finger) for finger in _FINGERS]]
-    bend = fingers[:, 2:] - 2.0 * fingers[:, 1:-1] + fingers[:, :-2]
-    return 0.5 * bend.square().sum((-1, -2)).mean()
+    fingers = hand_pose.reshape(len(hand_pose), 5, -1)
+    bend = hand_pose.new_tensor(_ACROSS) @ fingers
+    return 0.5 * bend.square().sum() / (len(hand_pose) * 2 * 3)

@@ -265,7 +265,9 @@ DEMO = replace(
 
 # Finer images and fields, and more steps where colours decide. Silhouettes alone get their steps of `fast`:
 # more of them bend hidden fingers and change the hands' size to fit what masks do not tell. In the many steps
-# of `detail` fingers move slowly for the same reason.
+# of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said: colours, which
+# light and shade never explain altogether, would in time turn it by some tenths of a degree.
+_FIRM_OBJECT = {"object_prior": 50.0}
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
@@ -283,12 +285,13 @@ FULL = replace(
         _CONTACT,
         _REGRASP,
         SplitStage(),
-        replace(_JOINT, steps=300),
+        replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT),
         replace(
             _DETAIL,
             steps=1000,
             image_size=640,
             lrs=_DETAIL.lrs | {"hand.pose": 0.0016, "hand.grasp_pose": 0.0008},
+            weights=_DETAIL.weights | _FIRM_OBJECT,
         ),
         CompletionStage(),
         GuidanceStage(steps=600),
