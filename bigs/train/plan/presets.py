@@ -265,8 +265,8 @@ DEMO = replace(
 
 # Finer images and fields, and more steps where colours decide. Silhouettes alone get their steps of `fast`:
 # more of them bend hidden fingers and change the hands' size to fit what masks do not tell. In the many steps
-# of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said: colours, which
-# light and shade never explain altogether, would in time turn it by some tenths of a degree.
+# of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said: colours,
+# which light and shade never explain altogether, would in time turn it by some tenths of a degree.
 _FIRM_OBJECT = {"object_prior": 50.0}
 FULL = replace(
     FAST,
