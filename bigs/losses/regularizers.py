@@ -42,3 +42,13 @@ def finger_unevenness(hand_pose: Tensor) -> Tensor:
     fingers = hand_pose.reshape(len(hand_pose), 5, -1)
     bend = hand_pose.new_tensor(_ACROSS) @ fingers
     return 0.5 * bend.square().sum() / (len(hand_pose) * 2 * 3)
+
+
+def impossible_turn(hand_pose: Tensor, turns: Tensor) -> Tensor:
+    """Mean squared sine of the turns that joints cannot make.
+
+    Args:
+        hand_pose: rotations [T, 15, 3, 3].
+        turns: [M, 15, 3, 3], see `HandModel.impossible_turns`.
+    """
+    return (hand_pose.flatten(1) @ turns.flatten(1).T).square().mean()

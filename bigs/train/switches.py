@@ -234,7 +234,10 @@ _INGREDIENTS = {
     ),
     "pose_priors": Switch(
         "what keeps poses, depths and shape near their estimates",
-        _terms("orient_prior", "pose_prior", "fingers_even", "depth_prior", "betas_prior", "object_prior"),
+        _terms(
+            *("orient_prior", "pose_prior", "fingers_even", "joint_axes"),
+            *("depth_prior", "betas_prior", "object_prior"),
+        ),
     ),
     "hand_geometry": Switch(
         "offsets, rotations and scales of the hand's Gaussians",

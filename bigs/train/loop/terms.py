@@ -20,6 +20,7 @@ from bigs.losses.photometric import masked_ssim
 from bigs.losses.regularizers import (
     color_spread,
     finger_unevenness,
+    impossible_turn,
     lbs_deviation,
     scale_size,
     squared_norm,
@@ -245,6 +246,14 @@ def fingers_even(step: Step) -> Tensor:
     return _mean(finger_unevenness(step.posed_clip.hand(side).hand_pose) for side in step.scene.sides)
 
 
+def joint_axes(step: Step) -> Tensor:
+    """How far finger joints turn about axes that they do not have, squared radians, a mean over hands."""
+    return _mean(
+        impossible_turn(step.posed_clip.hand(side).hand_pose, step.scene.hand_model(side).impossible_turns)
+        for side in step.scene.sides
+    )
+
+
 def depth_prior(step: Step) -> Tensor:
     """Squared relative distance from the depth that a frame outside grasps is expected to have."""
 
@@ -362,6 +371,7 @@ TERMS: dict[str, Term] = {
         orient_prior=orient_prior,
         pose_prior=pose_prior,
         fingers_even=fingers_even,
+        joint_axes=joint_axes,
         depth_prior=depth_prior,
         betas_prior=betas_prior,
         object_prior=object_prior,

@@ -26,12 +26,14 @@ _POSE_PRIORS = {
     "betas_prior": 0.01,
     "pose_prior": 1.0,
     "fingers_even": 0.3,
+    "joint_axes": 12.0,
     "orient_prior": 0.1,
     "acceleration": 0.005,
 }
-# Grasps average over frames, so their estimates count more. The two priors on fingers keep one ratio: that in
-# which a regressor's error and the unevenness of fingers usually are.
-_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5}
+# Grasps average over frames, so their estimates count more. The three priors on fingers keep their ratios:
+# those in which a regressor's errors (12 degrees), the unevenness of fingers, and turns about axes that a
+# joint does not have (4 degrees, since a model's axes are not exactly a hand's) usually are.
+_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5, "joint_axes": 60.0}
 
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
@@ -134,6 +136,7 @@ _PLAUSIBLE_TOGETHER = {
     # Colours now say what these priors had to say before.
     "pose_prior": 0.2,
     "fingers_even": 0.06,
+    "joint_axes": 2.4,
     "depth_prior": 12.0,
     "rigid": 0.03,
     "contact": 0.1,
@@ -172,7 +175,7 @@ _JOINT = OptimizeStage(
         "image": 4.0,
         "mse": 30.0,
         "alpha_outside": 4.0,
-        "labels": 0.5,
+        "labels": 4.0,
         "silhouette": 4.0,
         **_PLAUSIBLE_TOGETHER,
     },
@@ -213,7 +216,7 @@ _DETAIL = OptimizeStage(
         "image": 4.0,
         "mse": 300.0,
         "alpha_outside": 25.0,
-        "labels": 0.5,
+        "labels": 2.0,
         **_PLAUSIBLE_TOGETHER,
     },
     image_size=480,
