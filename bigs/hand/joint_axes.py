@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bigs.hand.model import HandModel
+
 # MANO's tips in the order of its fingers, which are index, middle, pinky, ring and thumb.
 _TIP_OF_FINGER = (1, 2, 4, 3, 0)
 _THUMB = 4
@@ -17,17 +19,14 @@ _THUMB = 4
 _BACK = (0.0, 1.0, 0.0)
 
 
-def impossible_turns(rest_joints: Tensor, tips: Tensor) -> Tensor:
+def impossible_turns(model: HandModel) -> Tensor:
     """Linear functions of finger rotations, each the sine of a turn that a joint cannot make.
-
-    Args:
-        rest_joints: [16, 3] in MANO's order and axes, of either hand.
-        tips: [5, 3] of thumb, index, middle, ring and pinky.
 
     Returns:
         [22, 15, 3, 3] coefficients; the sum of their products with rotations [15, 3, 3] is zero for a pose in
         which every joint turns as it can.
     """
+    rest_joints, tips = model.J_regressor @ model.v_template, model.v_template[model.tip_vertex_ids]
     rows = []
     back = rest_joints.new_tensor(_BACK)
     for finger, tip in enumerate(_TIP_OF_FINGER):

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from bigs.checks import check_shape
 from bigs.fused.posing import Posing, skin
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-from bigs.hand.joint_axes import impossible_turns
 from bigs.hand.lbs import forward_kinematics, pose_corrective, shape_vertices
 from bigs.hand.mirror import mirror_axis_angle, mirror_points
 from bigs.types import Side
@@ -59,7 +58,6 @@ class HandModel(nn.Module):
         lbs_weights: [V, 16] skinning weights, rows sum to 1.
         hands_mean: [15, 3] mean finger pose, axis-angle.
         tip_vertex_ids: [5] long, thumb, index, middle, ring, pinky.
-        impossible_turns: [22, 15, 3, 3] sines of what joints cannot do, as functions of finger rotations.
     """
 
     v_template: Tensor
@@ -70,7 +68,6 @@ class HandModel(nn.Module):
     lbs_weights: Tensor
     hands_mean: Tensor
     tip_vertex_ids: Tensor
-    impossible_turns: Tensor
 
     def __init__(
         self,
@@ -101,8 +98,6 @@ class HandModel(nn.Module):
             self.register_buffer(name, _tensor(values, torch.float32), persistent=False)
         self.register_buffer("faces", _tensor(faces, torch.int64), persistent=False)
         self.register_buffer("tip_vertex_ids", _tensor(tip_vertex_ids, torch.int64), persistent=False)
-        turns = impossible_turns(self.J_regressor @ self.v_template, self.v_template[self.tip_vertex_ids])
-        self.register_buffer("impossible_turns", turns, persistent=False)
         # Most other models have no correctives, and the product with zeros would be the largest cost of a
         # pose.
         self.has_posedirs = bool(self.posedirs.any())

@@ -49,6 +49,6 @@ def impossible_turn(hand_pose: Tensor, turns: Tensor) -> Tensor:
 
     Args:
         hand_pose: rotations [T, 15, 3, 3].
-        turns: [M, 15, 3, 3], see `HandModel.impossible_turns`.
+        turns: [M, 15, 3, 3], see `hand.impossible_turns`.
     """
     return (hand_pose.flatten(1) @ turns.flatten(1).T).square().mean()

@@ -249,7 +249,7 @@ def fingers_even(step: Step) -> Tensor:
 def joint_axes(step: Step) -> Tensor:
     """How far finger joints turn about axes that they do not have, squared radians, a mean over hands."""
     return _mean(
-        impossible_turn(step.posed_clip.hand(side).hand_pose, step.scene.hand_model(side).impossible_turns)
+        impossible_turn(step.posed_clip.hand(side).hand_pose, step.evidence.impossible_turns[side])
         for side in step.scene.sides
     )
 
