@@ -51,6 +51,18 @@ class FreeGaussians(nn.Module):
         self.color_logits.copy_(torch.logit(colors.clamp(1e-3, 1.0 - 1e-3)))
         self.normals.copy_(normals)
 
+    @torch.no_grad()
+    def release(self, chosen: Tensor) -> None:
+        """Let those `chosen` [N] (bool) change as much as any from now on; they stay as they are."""
+        free = (self.freedom * chosen)[:, None]
+        self.base_means += free * self.shift[:, None] * self.normals
+        self.base_log_scales += free * self.size
+        self.opacity_logits += free[:, 0] * self.opacity
+        self.color_logits += free * self.color
+        for residual in self.parameters():
+            residual[chosen] = 0.0
+        self.freedom[chosen] = 1.0
+
     @property
     def offsets(self) -> Tensor:
         """[N, 3] metres from the start."""

@@ -41,7 +41,9 @@ class ObjectDetail(FreeGaussians):
 
 
 @torch.no_grad()
-def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> ObjectDetail:
+def split_object(
+    whole: CanonicalObject, parts: int, least_opacity: float, freedom: Tensor | None = None
+) -> ObjectDetail:
     """Every Gaussian as `parts` x `parts` smaller ones in the plane of its first two axes.
 
     They stand where the parts of its share of the surface lie, and are as much smaller.
@@ -50,6 +52,7 @@ def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> Ob
         whole: the object.
         parts: along each of the two axes; 1 only prunes.
         least_opacity: Gaussians that are less opaque than this are left out.
+        freedom: [N] in [0, 1], the factor on what the parts of each learn from now on; 1 if not given.
 
     Raises:
         InputError: none is as opaque as that.
@@ -78,6 +81,8 @@ def split_object(whole: CanonicalObject, parts: int, least_opacity: float) -> Ob
         each(whole.normals[kept]),
     )
     detail.weights.copy_(each(whole.weights[kept]))
+    if freedom is not None:
+        detail.freedom.copy_(each(freedom[kept]))
     return detail
 
 

@@ -43,7 +43,7 @@ from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
 from bigs.train.start.object_motion import find_object_motion, in_words
 from bigs.train.unseen.stages import OBSERVED_AT, finish_mesh, run_completion, run_guidance
-from bigs.train.unseen.visibility import hands_shown
+from bigs.train.unseen.visibility import shown
 from bigs.types import Side
 
 
@@ -224,9 +224,7 @@ def _image_sizes(stages: Sequence[Stage]) -> list[int]:
     for stage in stages:
         if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage):
             sizes.append(stage.image_size)
-        elif not isinstance(stage, ObjectMotionStage) and not (
-            isinstance(stage, SplitStage) and not stage.hands
-        ):
+        elif not isinstance(stage, ObjectMotionStage):
             sizes.append(OBSERVED_AT.image_size)
     return sizes
 
@@ -253,15 +251,15 @@ def _object_motion(
 def _split(scene: Scene, stage: SplitStage, sources: EvidenceSource) -> list[str]:
     """Free the scene's Gaussians of their fields; returns what to report."""
     notes = []
+    freedom = shown(scene, sources.evidence(OBSERVED_AT))
     if stage.hands:
-        shown = hands_shown(scene, sources.evidence(OBSERVED_AT))
         for side, hand in scene.hand_splats.items():
-            scene.hand_splats[side] = free_hand(hand, shown[side])
+            scene.hand_splats[side] = free_hand(hand, freedom[side])
             notes.append(f"{len(scene.hand_splats[side].shift)} Gaussians of the hand are free")
     if scene.object_splats is not None:
         with torch.no_grad():
             whole = scene.object_splats()
-        scene.object_splats = split_object(whole, stage.parts, stage.least_opacity)
+        scene.object_splats = split_object(whole, stage.parts, stage.least_opacity, freedom["object"])
         count = len(scene.object_splats.shift)
         notes.append(f"{len(whole.means)} Gaussians of the object become {count}")
     return notes

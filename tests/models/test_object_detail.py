@@ -62,6 +62,35 @@ def test_what_cannot_be_seen_is_pruned() -> None:
     assert len(detail().means) == 4 * (len(opacities) - 10)
 
 
+def test_parts_are_as_free_as_what_they_were() -> None:
+    whole = plate()
+    freedom = torch.linspace(0.0, 1.0, len(whole.means))
+    whole = whole._replace(opacities=torch.where(torch.arange(len(freedom)) < 10, 0.01, whole.opacities))
+    detail = split_object(whole, 2, 0.05, freedom)
+    torch.testing.assert_close(detail.freedom, freedom[10:].repeat_interleave(4))
+    assert (split_object(whole, 2, 0.05).freedom == 1.0).all()
+
+
+def test_what_is_released_stays_and_can_move() -> None:
+    detail = split_object(plate(), 1, 0.0, torch.full((64,), 0.25))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for residual in detail.parameters():
+            residual += 0.1 * torch.randn(residual.shape, generator=generator)
+    before, chosen = detail(), torch.arange(64) < 20
+    kept = {name: value[~chosen].clone() for name, value in detail.state_dict().items()}
+    detail.release(chosen)
+    after = detail()
+    for name in ("means", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name))
+    for name, value in detail.state_dict().items():
+        assert torch.equal(value[~chosen], kept[name]), name
+    with torch.no_grad():
+        detail.shift += 0.001
+    moved = (detail().means - before.means).norm(dim=-1)
+    torch.testing.assert_close(moved, torch.where(chosen, 0.001, 0.00025), atol=1e-6, rtol=0)
+
+
 def test_an_object_does_not_vanish() -> None:
     with pytest.raises(InputError, match=r"least_opacity: expected 0\.950, .*found 0\.99"):
         split_object(plate(), 2, 0.99)

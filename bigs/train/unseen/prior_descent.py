@@ -115,10 +115,12 @@ def guide_object(
         "color": stage.lr_color,
     }
     parameters = {name: getattr(detail, name) for name in rates}
-    found = {name: value.detach().clone() for name, value in parameters.items()}
+    found = {name: value.clone() for name, value in detail.state_dict().items()}
+    unseen = ~coverage.seen
+    # What hardly shows kept what its field made of it. Now it is the prior's.
+    detail.release(unseen)
     with torch.no_grad():
         start = detail().means.clone()
-    unseen = ~coverage.seen
     neighbours, spacing = _neighbours(start)
     before = faults()
     for parameter in parameters.values():
@@ -130,7 +132,9 @@ def guide_object(
     if resume is not None:
         done = resume["step"]
         optimizer.set_moments(resume["moments"])
-        _fill(parameters, resume["reached"])
+        with torch.no_grad():
+            for name, parameter in parameters.items():
+                parameter.copy_(resume["reached"][name])
     for step in range(done, stage.steps):
         # A function of seed and step, so that a resumed run draws the same.
         generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
@@ -161,16 +165,10 @@ def guide_object(
         parameter.requires_grad_(False)
     worst = float((faults() / before.clamp_min(1e-12)).max()) - 1.0
     if worst > stage.damage:
-        _fill(parameters, found)
+        detail.load_state_dict(found)
         return Guided(torch.zeros_like(start), worst, True)
     with torch.no_grad():
         return Guided(detail().means - start, worst, False)
-
-
-@torch.no_grad()
-def _fill(parameters: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
-    for name, parameter in parameters.items():
-        parameter.copy_(values[name])
 
 
 def _freed(canonical: CanonicalObject, free: Tensor) -> CanonicalObject:
