@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
@@ -15,3 +15,9 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
         KeyError: a term has no weight. (A weight whose term was never computed is the stage's error.)
     """
     return torch.stack([weights[name] * term for name, term in terms.items()]).sum()
+
+
+def mean_of(values: Iterable[Tensor]) -> Tensor:
+    """The mean of scalars, such as one for each subject; 0 of none."""
+    values = list(values)
+    return torch.stack(values).mean() if values else torch.zeros(())

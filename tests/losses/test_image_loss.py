@@ -14,7 +14,7 @@ from bigs.losses.regularizers import (
     scale_size,
     squared_norm,
 )
-from bigs.losses.weighted import weighted_sum
+from bigs.losses.weighted import mean_of, weighted_sum
 
 
 def images(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -129,3 +129,8 @@ def test_gradients(mask) -> None:
     for loss in (color_spread, scale_size, squared_norm):
         assert torch.autograd.gradcheck(loss, rows)
     assert torch.autograd.gradcheck(lbs_deviation, (rows, images(5, 3, seed=3)))
+
+
+def test_a_mean_over_no_subject_is_zero() -> None:
+    assert mean_of([]).item() == 0.0
+    assert mean_of(torch.tensor(value) for value in (1.0, 4.0)).item() == pytest.approx(2.5)

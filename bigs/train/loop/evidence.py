@@ -15,10 +15,10 @@ from bigs.models.hand_splats import silhouette_hand
 from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
+from bigs.train.loop.image_terms import labels
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.loop.targets import Targets
-from bigs.train.loop.terms import labels
 from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side

@@ -16,8 +16,8 @@ from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
 from bigs.train.grasps.find import carried_errors, expected_depths, find_grasps, turned_between
+from bigs.train.loop.pose_terms import depth_prior
 from bigs.train.loop.step import Selection, Step
-from bigs.train.loop.terms import depth_prior
 from bigs.train.plan.config import GraspStage, RunConfig
 from bigs.types import Side
 
