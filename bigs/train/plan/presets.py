@@ -246,7 +246,7 @@ FAST = RunConfig(
     ),
 )
 
-# For a little clip, in 30 to 40 seconds on two cores.
+# For a little clip, in well under a minute on two cores.
 DEMO = replace(
     FAST,
     stages=(
