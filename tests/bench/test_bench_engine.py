@@ -142,7 +142,7 @@ def test_memory_of_some_work() -> None:
     assert free is None or free > 2**20
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no record of this process alone")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc/self/status")
 def test_the_largest_so_far_is_not_that_of_the_process_that_started_this_one() -> None:
     """Linux keeps `ru_maxrss` over exec: `bigs prior fit` called from a notebook told the notebook's size."""
     large = bytearray(os.urandom(1)) * 300_000_000

@@ -47,13 +47,8 @@ def test_bending_is_free(hand: HandModel, angle: float) -> None:
         vectors[0, joint] = angle * across(hand, joint)
     assert impossible_turn(axis_angle_to_matrix(vectors), impossible_turns(hand)).item() < 1e-13
     for joint in (0, 3, 6, 9):
-        along, back = bone(hand, joint), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-        for axis in (
-            across(hand, joint),
-            torch.linalg.cross(across(hand, joint), along),
-            back - back @ along * along,
-        ):
-            turned = posed(joint, angle * axis / axis.norm())
+        for axis in (across(hand, joint), torch.linalg.cross(across(hand, joint), bone(hand, joint))):
+            turned = posed(joint, angle * axis)
             assert impossible_turn(turned, impossible_turns(hand)).item() < 1e-13
 
 

@@ -18,7 +18,7 @@ from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel
 from bigs.types import Side
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="needs signals")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")]
 
 STAGES = ("hands-coarse", "hands-fine", "grasped", "appearance", "contact", "regrasp", "joint", "detail")
 QUICK = [f"stages.{stage}.{change}" for stage in STAGES for change in ("steps=4", "image_size=40")]

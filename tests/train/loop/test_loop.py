@@ -334,6 +334,18 @@ def test_the_papers_smoothness_is_of_fingers_and_wrist_alone(scene: Scene, evide
     assert TERMS["smooth"](step) > still + 1.0
 
 
+def test_fingers_that_twist_are_turned_back_on_both_hands(scene: Scene, evidence: Evidence) -> None:
+    with torch.no_grad():
+        for poses in scene.hand_poses.values():
+            poses.pose[:, 0, 0] = 0.5  # about the bone of the index
+    stage = replace(ALONE, steps=30, lrs={"hand.pose": 0.05}, weights={"joint_axes": 1.0})
+    losses: list[float] = []
+    run_stage(scene, stage, evidence, 0, after_step=lambda p, _: losses.append(p.loss))
+    assert losses[-1] < 0.1 * losses[0]
+    for poses in scene.hand_poses.values():
+        assert poses.pose[:, 0, 0].abs().max() < 0.2
+
+
 def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None:
     """On an ordinary scene, each term alone can be asked for and can be differentiated."""
     evidence = replace(evidence, denoiser=LinearDenoiser(24, dtype=torch.float32))
