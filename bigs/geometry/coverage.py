@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,13 @@ class ObjectViews:
         """Unit directions [N, 3] from points [N, 3] to frame t's camera, object frame."""
         towards = -self.centers[t] @ self.rotations[t] - points
         return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+
+
+class MeasuredPoints(NamedTuple):
+    """Points of an object that were measured, and the lines of sight that measured them."""
+
+    points: np.ndarray  # [N, 3] metres, object frame
+    sightings: np.ndarray  # [M, 2] frame and index of points whose place is sure, each time they were seen
 
 
 def times_seen(

@@ -129,15 +129,14 @@ class VisualHull:
     def _poses(self) -> fused.Poses:
         return fused.Poses(self.K, self.rotations, self.centers)
 
-    def outward(self, points: np.ndarray, step: float) -> np.ndarray:
-        """Directions [N, 3] in which the hull's distance grows, by central differences of `step` metres."""
-        slopes = [
-            self.distance(points + step * axis) - self.distance(points - step * axis) for axis in np.eye(3)
-        ]
-        # Deep inside the slope is exactly zero; there the direction from the middle decides.
-        away = points - points.mean(0)
-        return np.stack(slopes, axis=-1) + 1e-3 * away / np.linalg.norm(away, axis=-1, keepdims=True).clip(
-            1e-9
+    def slope(self, points: np.ndarray, step: float) -> np.ndarray:
+        """Gradients [N, 3] of `distance` at points [N, 3], by central differences of `step` metres."""
+        return np.stack(
+            [
+                (self.distance(points + step * axis) - self.distance(points - step * axis)) / (2.0 * step)
+                for axis in np.eye(3)
+            ],
+            axis=-1,
         )
 
 
@@ -149,15 +148,6 @@ def convex_distance(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
 def distance_to_planes(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """The largest signed distance [N] of points [N, 3] to planes [M, 4]: unit normal and offset."""
     return fused.beyond_planes(points, planes)
-
-
-def point_normals(points: np.ndarray, outward: np.ndarray, neighbours: int = 12) -> np.ndarray:
-    """Normals [N, 3] of a point cloud by local planes, turned towards the directions `outward` [N, 3]."""
-    _, index = scipy.spatial.cKDTree(points).query(points, k=min(neighbours, len(points)))
-    patches = points[index] - points[index].mean(axis=1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))
-    normals = axes[:, :, 0]
-    return normals * np.where((normals * outward).sum(-1, keepdims=True) < 0, -1.0, 1.0)
 
 
 def neighbour_distances(points: np.ndarray, neighbours: int = 6) -> np.ndarray:

@@ -18,7 +18,7 @@ import scipy.ndimage
 from PIL import Image
 
 from bigs import _raster
-from bigs.geometry.surface import point_normals
+from bigs.geometry.normals import point_normals
 from bigs.motion.features import crop_box
 from bigs.motion.object_map import ObjectMap
 

@@ -39,3 +39,31 @@ def color_points(map_: ObjectMap, tracks: np.ndarray, images: Sequence[np.ndarra
     _, starts = np.unique(slot[map_.track[rows]][order], return_index=True)
     medians = [np.median(group, axis=0) for group in np.split(found[order], starts[1:])]
     return np.round(medians).astype(np.uint8).reshape(-1, 3)
+
+
+def sure_sightings(map_: ObjectMap, tracks: np.ndarray) -> np.ndarray:
+    """Frame and index among `tracks` [N] of each sighting [M, 2] of those whose place is sure.
+
+    A wrong match is rarely confirmed by many frames, and a point that was seen from one side alone may lie
+    anywhere along its ray.
+    """
+    slot = np.full(len(map_.points), -1)
+    slot[tracks] = np.arange(len(tracks))
+    rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))
+    frame, index = map_.frame[rows], slot[map_.track[rows]]
+    eyes = -np.einsum("tji,tj->ti", map_.rotations, map_.transl)
+    rays = map_.points[map_.track[rows]] - eyes[frame]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    mean = np.zeros((len(tracks), 3))
+    np.add.at(mean, index, rays)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True).clip(1e-9)
+    cosine = np.ones(len(tracks))
+    np.minimum.at(cosine, index, (rays * mean[index]).sum(1))
+    often = np.bincount(index, minlength=len(tracks)) >= _SURE_SIGHTINGS
+    sure = often & (cosine < np.cos(np.radians(_SURE_ANGLE)))
+    return np.stack([frame, index], axis=1)[sure[index]]
+
+
+# How often a point must be seen, and by how much its rays must leave their mean (degrees), before its place
+# is sure.
+_SURE_SIGHTINGS, _SURE_ANGLE = 6, 10.0

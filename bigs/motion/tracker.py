@@ -25,7 +25,7 @@ from bigs.motion.follow import FollowConfig, follow
 from bigs.motion.models import MappingConfig, match_features
 from bigs.motion.object_map import MapConfig, ObjectMap
 from bigs.motion.patches import PatchConfig, Pictures, sharpen
-from bigs.motion.points import color_points, trim_points
+from bigs.motion.points import color_points, sure_sightings, trim_points
 from bigs.motion.refine import polish
 from bigs.motion.tracks import Tracks, join_matches
 
@@ -88,6 +88,7 @@ class TrackedMotion(NamedTuple):
     contradicted: np.ndarray  # [T] bool: matches contradict the given pose
     points: np.ndarray  # [N, 3] metres
     colors: np.ndarray  # [N, 3] uint8
+    sightings: np.ndarray  # [M, 2] frame and index of each sighting of the points whose place is sure
     turn_sigma: float  # estimated error of the given rotations, radians
     shift_sigma: np.ndarray  # [3] the same of positions, metres
 
@@ -157,6 +158,7 @@ def track_matches(
         contradicted,
         map_.points[used],
         colors,
+        sure_sightings(map_, used),
         map_.anchor.turn_sigma,
         map_.anchor.shift_sigma,
     )

@@ -22,7 +22,7 @@ from bigs.geometry.surface import DistanceGrid, inlier_points
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
 from bigs.preprocess.hands.tracks import posed_track
-from bigs.preprocess.object.rough_surface import RoughSurface, SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.object.rough_surface import RoughSurface, SurfaceConfig, rough_surface, sights
 from bigs.types import Side
 
 
@@ -109,8 +109,8 @@ def align(
     guess = first_scale(verts, touching, hands, sfm)
     points = guess * sfm.points
     points = points[inlier_points(points)]
-    hull = visual_hull(points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface)
-    surface = rough_surface(points, hull, config.surface)
+    seen = sights(points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface)
+    surface = rough_surface(points, seen, config.surface)
     factors = np.exp(np.linspace(-config.span, config.span, config.sizes))
     frames = sum(int(t.sum()) for t in touching.values())
     if frames == 0:

@@ -15,7 +15,6 @@ from bigs.geometry.surface import (
     empty_grid,
     extract_mesh,
     inlier_points,
-    point_normals,
     silhouette_around_points,
     silhouette_distance,
 )
@@ -108,7 +107,7 @@ def test_hull_of_a_ball_has_its_radius(hull: VisualHull) -> None:
 
 def test_hull_distance_grows_outwards(hull: VisualHull) -> None:
     directions = even_directions(60)
-    outward = hull.outward(MIDDLE + RADIUS * directions, 0.5 * PIXEL)
+    outward = hull.slope(MIDDLE + RADIUS * directions, 0.5 * PIXEL)
     cosine = (outward * directions).sum(-1) / np.linalg.norm(outward, axis=-1)
     assert cosine.min() > 0.5 and cosine.mean() > 0.9
 
@@ -266,15 +265,6 @@ def test_convex_distance_of_a_cube() -> None:
     cube = np.array(np.meshgrid([0.0, 1], [0.0, 1], [0.0, 1])).reshape(3, -1).T
     points = np.array([[0.5, 0.5, 0.5], [0.9, 0.5, 0.5], [1.0, 0.2, 0.3], [0.5, 0.5, 3.0]])
     np.testing.assert_allclose(convex_distance(points, cube), [-0.5, -0.1, 0.0, 2.0], atol=1e-12)
-
-
-def test_point_normals_follow_the_surface_and_the_given_side() -> None:
-    directions = even_directions(500)
-    # Only the side is taken from the given directions: these are 60 degrees off.
-    tilted = directions + 1.7 * np.cross(directions, [0.0, 0.6, 0.8])
-    normals = point_normals(RADIUS * directions, tilted)
-    assert (normals * directions).sum(-1).min() > 0.99
-    np.testing.assert_allclose(point_normals(RADIUS * directions, -tilted), -normals)
 
 
 def test_stray_points_are_not_inliers() -> None:

@@ -18,7 +18,7 @@ from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices, sample_grid
 from bigs.preprocess.artefacts import ObjectSfm
-from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, sights
 from bigs.types import Side
 
 FRAMES = 12
@@ -127,10 +127,10 @@ def test_between_points_and_visual_hull_there_may_be_object(truth: Truth, possib
     points = UNIT * truth.sfm.points
     config = SurfaceConfig(possible=possible)
     poses = (truth.sfm.rotations, UNIT * truth.sfm.transl)
-    hull = visual_hull(points, *poses, truth.sfm.confidence, truth.masks, truth.K, config)
-    solid, outer = rough_surface(points[points[:, 2] > np.median(points[:, 2])], hull, config)
+    seen = sights(points, *poses, truth.sfm.confidence, truth.masks, truth.K, config)
+    solid, outer = rough_surface(points[points[:, 2] > np.median(points[:, 2])], seen, config)
     known, met = solid.values.ravel(), outer.values.ravel()
-    inside = hull.distance(solid.points()) <= 0.0
+    inside = seen.hull.distance(solid.points()) <= 0.0
     unknown = inside & (known > possible)
     assert unknown.sum() > 100
     np.testing.assert_allclose(met[unknown], possible)

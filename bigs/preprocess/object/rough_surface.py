@@ -7,15 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bigs.geometry.coverage import ObjectViews
+from bigs.geometry.normals import outward_normals
 from bigs.geometry.surface import (
     DistanceGrid,
     VisualHull,
     blend_with_points,
     convex_distance,
     empty_grid,
-    point_normals,
     silhouette_around_points,
 )
+from bigs.types import MASK_VALUES
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,17 @@ class SurfaceConfig:
     reach: float = 0.016  # distance from the nearest point at which the hull alone decides
     margin: float = 0.01  # how far the surface may leave the points' convex hull
     possible: float = 0.001  # distance that a hand counts as off where object is possible but not known
+    tolerance: float = 0.006  # by which errors of poses may put a point behind one that hides it
 
 
-def visual_hull(
+class Sights(NamedTuple):
+    """What some frames tell about the object's shape."""
+
+    hull: VisualHull  # what their silhouettes leave
+    views: ObjectViews  # what they saw of it
+
+
+def sights(
     points: np.ndarray,
     rotations: np.ndarray,
     transl: np.ndarray,
@@ -38,8 +48,8 @@ def visual_hull(
     masks: np.ndarray,
     K: np.ndarray,
     config: SurfaceConfig,
-) -> VisualHull:
-    """The silhouettes that carve, of frames spread over the clip.
+) -> Sights:
+    """What frames spread over the clip tell about the object's shape.
 
     Args:
         points: [N, 3] metres, object frame, without strays.
@@ -54,8 +64,10 @@ def visual_hull(
     silhouettes = [
         silhouette_around_points(masks[t] != 0, points @ rotations[t].T + transl[t], K) for t in chosen
     ]
-    return VisualHull(
-        np.stack(silhouettes), K, rotations[chosen], transl[chosen], min(config.agreeing, len(chosen))
+    poses = (rotations[chosen], transl[chosen])
+    return Sights(
+        VisualHull(np.stack(silhouettes), K, *poses, min(config.agreeing, len(chosen))),
+        ObjectViews(masks[chosen] == MASK_VALUES["object"], K, *poses),
     )
 
 
@@ -69,16 +81,16 @@ class RoughSurface(NamedTuple):
     outer: DistanceGrid
 
 
-def rough_surface(points: np.ndarray, hull: VisualHull, config: SurfaceConfig) -> RoughSurface:
+def rough_surface(points: np.ndarray, seen: Sights, config: SurfaceConfig) -> RoughSurface:
     """The visual hull blended with the planes of points [N, 3], cut back to near their convex hull."""
     size = float((points.max(0) - points.min(0)).max())
     grid = empty_grid(points.min(0) - 0.15 * size, points.max(0) + 0.15 * size, config.resolution)
     corners = grid.points()
     bound = convex_distance(corners, points) - config.margin
-    to_hull = hull.distance(corners, stop=config.reach)
+    to_hull = seen.hull.distance(corners, stop=config.reach)
     distance = np.maximum(to_hull, bound)
     carved = DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing)
-    normals = point_normals(points, hull.outward(points, 0.5 * grid.spacing))
+    normals = outward_normals(points, seen.hull, seen.views, grid.spacing, config.tolerance)
     solid = blend_with_points(carved, points, normals, config.reach)
     outer = np.minimum(solid.values, to_hull.reshape(grid.values.shape).clip(0.0) + config.possible)
     return RoughSurface(solid, DistanceGrid(outer, grid.origin, grid.spacing))

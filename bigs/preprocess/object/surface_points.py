@@ -17,7 +17,7 @@ from bigs.geometry.coverage import ObjectViews, seen_in, times_seen
 from bigs.geometry.surface import DistanceGrid, extract_mesh, inlier_points, neighbour_distances
 from bigs.motion.points import normalisation
 from bigs.preprocess.artefacts import Alignment, ObjectSfm
-from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, visual_hull
+from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, sights
 from bigs.types import MASK_VALUES
 
 
@@ -67,12 +67,13 @@ def complete_points(
     points = alignment.scale * sfm.points
     poses = (alignment.object_rotations, alignment.object_transl)
     core = points[inlier_points(points)]
-    hull = visual_hull(core, *poses, sfm.confidence, masks, K, config.surface)
+    seen = sights(core, *poses, sfm.confidence, masks, K, config.surface)
+    hull = seen.hull
     inside = hull.distance(points) < config.outside
     core = points[inside & inlier_points(points)]
     if len(core) < _FEWEST_POINTS:
         return sfm
-    surface = rough_surface(core, hull, config.surface).solid
+    surface = rough_surface(core, seen, config.surface).solid
     if not (surface.values < 0).any():
         return sfm
     usable = np.flatnonzero(sfm.confidence > 0) if (sfm.confidence > 0).any() else np.arange(len(masks))

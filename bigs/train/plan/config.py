@@ -189,15 +189,16 @@ class GuidanceStage:
 
 @dataclass(frozen=True)
 class OpeningConfig:
-    """When the object's mesh is opened where hands are seen through it (see `train.unseen.openings`)."""
+    """When the object's mesh is opened where something is seen through it (see `train.unseen.openings`)."""
 
-    # A hand that shows further than this behind the surface is seen through it, metres: more than a hand's
-    # depth is usually wrong by.
+    # A hand or point that shows further than this behind the surface is seen through it, metres: more than a
+    # hand's depth is usually wrong by.
     depth: float = 0.012
-    # Frames that must show it, which must be this share of all, and the least area of what they prove to be
-    # open, square metres.
+    # Frames that must show it, which must be this share of all for hands and this for points, of which a few
+    # are always wrong; and the least area of what they prove to be open, square metres.
     frames: int = 5
     share: float = 0.08
+    points_share: float = 0.16
     area: float = 1e-4
     # Surface nearer than this to a measured point is there, metres.
     measured: float = 0.004

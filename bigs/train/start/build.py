@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bigs.data.base import Clip
+from bigs.geometry.coverage import MeasuredPoints
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.mesh import face_areas, sample_surface
 from bigs.geometry.support import Support, seen_samples
@@ -50,7 +51,7 @@ class SceneStart(NamedTuple):
     skipped: list[str]  # what was not done, or replaced by something simpler, and why
     symmetries: list[Symmetry]  # of the object, where they were looked for
     known: KnownPart | None  # of the object's surface, if that is not all
-    measured: np.ndarray  # [N, 3] measured points of the object, metres; none without an object
+    measured: MeasuredPoints  # of the object; none without an object
 
 
 def build_scene(
@@ -86,7 +87,8 @@ def build_scene(
     skipped: list[str] = []
     symmetries: list[Symmetry] = []
     known = None
-    measured = np.empty((0, 3))
+    nothing = np.empty((0, 2), dtype=int)
+    measured = MeasuredPoints(np.empty((0, 3)), nothing)
     object_parts = dict.fromkeys(("object_splats", "object_poses", "object_surface", "object_distance"), None)
     if clip.object is not None:
         start = object_in_camera(clip, initial)
@@ -95,7 +97,10 @@ def build_scene(
             start = smooth_object(start, initial.smooth_object)
         else:
             start = with_motion(start, motion)
-        measured = start.points if motion is None else motion.points
+        if motion is None:
+            measured = MeasuredPoints(start.points, nothing)
+        else:
+            measured = MeasuredPoints(motion.points, motion.sightings)
         surfaces = _object_surfaces(clip, unknown, start, initial, completion)
         skipped, symmetries, known = surfaces.skipped, surfaces.symmetries, surfaces.known
         verts, faces = surfaces.closed

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.geometry.coverage import ObjectViews
+from bigs.geometry.normals import outward_normals
 from bigs.geometry.surface import (
     DistanceGrid,
     VisualHull,
@@ -18,7 +19,6 @@ from bigs.geometry.surface import (
     convex_distance,
     distance_to_planes,
     empty_grid,
-    point_normals,
     silhouette_around_points,
 )
 from bigs.threads import side_by_side
@@ -137,14 +137,14 @@ def find_object_hull(
     points = start.points[hull.distance(start.points) < 0.25 * config.surface_reach]
     if len(points) < _MIN_POINTS:
         raise ValueError(f"only {len(points)} of {len(start.points)} points lie inside the silhouettes")
-    shown_here = labels == MASK_VALUES["object"]
+    views = ObjectViews(labels == MASK_VALUES["object"], clip.K, rotations, centers)
     shown = np.zeros(len(corners))
     near = distance < config.surface_reach
-    shown[near] = hull.share_seen(corners[near], shown_here)
+    shown[near] = hull.share_seen(corners[near], views.shown)
     return ObjectHull(
         DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing),
         shown,
         points,
-        point_normals(points, hull.outward(points, 0.5 * grid.spacing)),
-        ObjectViews(shown_here, clip.K, rotations, centers),
+        outward_normals(points, hull, views, grid.spacing, config.seen_tolerance),
+        views,
     )

@@ -1,4 +1,4 @@
-"""Openings: a closed surface has a lid where the object has none, and hands are seen through it."""
+"""Openings: a closed surface has a lid where the object has none, and what is behind it is seen there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import scipy.spatial
 import torch
 
 from bigs.fused.shape import times_empty
-from bigs.geometry.coverage import ObjectViews, seen_in
+from bigs.geometry.coverage import MeasuredPoints, ObjectViews, seen_in
 from bigs.geometry.mesh import face_areas, midpoint_subdivision, sample_surface, vertex_normals
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
@@ -31,26 +31,34 @@ _LEAST_SHOWN = 5
 
 
 def openings(
-    scene: Scene, surface: ObjectSurface, evidence: Evidence, measured: np.ndarray, config: OpeningConfig
+    scene: Scene,
+    surface: ObjectSurface,
+    evidence: Evidence,
+    measured: MeasuredPoints,
+    config: OpeningConfig,
 ) -> np.ndarray:
     """Which vertices [V] (bool) of the object's surface lie in openings.
 
-    Where a hand that the masks show lies behind surface, that surface cannot be there. The opening goes on
-    from there as far as nothing was measured and brightness varies over time as it does where a picture was
-    painted on the wrong place.
+    Where a hand that the masks show or a point that a frame measured lies behind surface, that surface cannot
+    be there. The opening goes on from there as far as nothing was measured and brightness varies over time as
+    it does where a picture was painted on the wrong place.
 
     Args:
-        scene: has an object and hands; its poses are final.
+        scene: has an object; its poses are final.
         surface: of the object.
         evidence: the clip at the size at which to look.
-        measured: points [N, 3] of the object that were measured, metres.
+        measured: points of the object.
         config: see there.
     """
     verts, faces = surface.verts.double().numpy(), surface.faces.numpy()
     views = object_views(scene, evidence)
-    unmeasured = scipy.spatial.cKDTree(measured).query(verts)[0] > config.measured
-    least = max(config.frames, config.share * scene.n_frames)
-    proven = unmeasured & (_hands_behind(scene, evidence, views, verts, config.depth) >= least)
+    unmeasured = scipy.spatial.cKDTree(measured.points).query(verts)[0] > config.measured
+    least, least_points = (
+        max(config.frames, share * scene.n_frames) for share in (config.share, config.points_share)
+    )
+    proven = _hands_behind(scene, evidence, views, verts, config.depth) >= least
+    proven |= _points_behind(views, verts, measured, config.depth) >= least_points
+    proven &= unmeasured
     area = _vertex_areas(verts, faces)
     if area[proven].sum() < config.area:
         return np.zeros(len(verts), dtype=bool)
@@ -89,6 +97,20 @@ def _hands_behind(
             one = slice(t, t + 1)
             frame = ObjectViews(inside[one], views.K, views.rotations[one], views.centers[one])
             count += times_empty(frame.shown, frame.poses, verts, follow @ hand[t], depth)
+    return count
+
+
+def _points_behind(
+    views: ObjectViews, verts: np.ndarray, measured: MeasuredPoints, depth: float
+) -> np.ndarray:
+    """In how many frames [V] a point that they measured lies more than `depth` behind vertices [V, 3]."""
+    count = np.zeros(len(verts), dtype=np.int64)
+    everywhere = np.ones_like(views.shown[:1])
+    frame, index = measured.sightings.T
+    for t in np.unique(frame):
+        one = slice(t, t + 1)
+        here = ObjectViews(everywhere, views.K, views.rotations[one], views.centers[one])
+        count += times_empty(here.shown, here.poses, verts, measured.points[index[frame == t]], depth)
     return count
 
 

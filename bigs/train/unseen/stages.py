@@ -67,7 +67,7 @@ def run_guidance(
 def finish_mesh(
     scene: Scene, start: SceneStart, sources: EvidenceSource, config: RunConfig, completed: bool
 ) -> dict[str, str]:
-    """Leave out of the object's mesh what nothing supports and what hands refute; returns facts to report.
+    """Leave out of the object's mesh what nothing supports and what is seen through; returns facts to report.
 
     `completed` says that symmetry completed it, which supports all of it.
     """
@@ -81,10 +81,12 @@ def finish_mesh(
             f"open: {start.known.left_out:.0%} of it would be further than "
             f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
         )
-    if config.openings is not None and scene.sides:
+    if config.openings is not None:
         found = openings(scene, surface, sources.evidence(OBSERVED_AT), start.measured, config.openings)
         if found.any():
             surface = without_openings(surface, found)
-            facts["object openings"] = f"{found.mean():.0%} of the mesh, where hands are seen through it"
+            facts["object openings"] = (
+                f"{found.mean():.0%} of the mesh, where hands or points are seen through it"
+            )
     scene.replace_surface(surface)
     return facts

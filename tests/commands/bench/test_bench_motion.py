@@ -31,6 +31,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, GivenPoses]
             np.arange(count) == 0,
             np.zeros((7, 3)),
             np.zeros((7, 3), dtype=np.uint8),
+            np.zeros((0, 2), dtype=int),
             0.02,
             np.full(3, 0.003),
         )

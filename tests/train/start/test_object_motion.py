@@ -42,6 +42,7 @@ def tracked(given: GivenPoses, turn: float = 2e-3) -> TrackedMotion:
         np.zeros(count, dtype=bool),
         np.zeros((0, 3)),
         np.zeros((0, 3), dtype=np.uint8),
+        np.zeros((0, 2), dtype=int),
         0.02,
         np.full(3, 0.003),
     )

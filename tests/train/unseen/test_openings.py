@@ -10,6 +10,7 @@ import torch
 import trimesh
 from toy_scenes import CENTER, HALF, cube_scene
 
+from bigs.geometry.coverage import MeasuredPoints
 from bigs.hand import HandModel
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.raster.settings import RasterSettings
@@ -70,9 +71,11 @@ def evidence(scene: Scene, *, flicker: float) -> Evidence:
     return Evidence(targets, {}, {}, {}, "surface", RasterSettings())
 
 
-def cube_points(scene: Scene) -> np.ndarray:
-    """Measured points: every vertex of the cube."""
-    return scene.object_surface.verts.numpy()[~on_plate(scene)].astype(np.float64)
+def cube_points(scene: Scene, *frames: int) -> MeasuredPoints:
+    """Measured points: every vertex of the cube, seen in `frames`."""
+    points = scene.object_surface.verts.numpy()[~on_plate(scene)].astype(np.float64)
+    sightings = [(t, i) for t in frames for i in range(len(points))]
+    return MeasuredPoints(points, np.array(sightings, dtype=int).reshape(-1, 2))
 
 
 def test_surface_before_a_hand_that_shows_is_open_and_no_other(scene: Scene) -> None:
@@ -95,9 +98,9 @@ def test_it_goes_on_where_brightness_varies_but_not_over_measured_points(scene: 
     strip = verts[on_plate(scene) & (verts[:, 0] < -0.1)]
     still = verts[:, 0] < -0.1
     clip.targets.images[:, :, :22] = 0.5
-    found = openings(
-        scene, scene.object_surface, clip, np.concatenate([cube_points(scene), strip]), OpeningConfig()
-    )
+    measured = cube_points(scene)
+    measured = measured._replace(points=np.concatenate([measured.points, strip]))
+    found = openings(scene, scene.object_surface, clip, measured, OpeningConfig())
     in_view = (np.abs(verts[:, 0]) < 0.1) & (np.abs(verts[:, 1]) < 0.08)
     beside = on_plate(scene) & in_view & ~behind_plate(scene, clip)
     assert found[beside].mean() > 0.8
@@ -118,3 +121,19 @@ def test_a_hand_that_the_masks_do_not_show_proves_nothing(scene: Scene) -> None:
     clip = evidence(scene, flicker=0.8)
     clip.targets.shares["right"].zero_()
     assert not openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig()).any()
+
+
+def test_surface_before_points_that_were_measured_through_it_is_open(scene: Scene) -> None:
+    clip = evidence(scene, flicker=0.0)
+    clip.targets.shares["right"].zero_()
+    plan = OpeningConfig()
+    sights = [cube_points(scene, *range(frames)) for frames in (plan.frames - 1, plan.frames)]
+    few, enough = (openings(scene, scene.object_surface, clip, measured, plan) for measured in sights)
+    assert not few.any()
+    # What the cube would show through, and nothing beside it.
+    verts = scene.object_surface.verts.numpy()
+    before = on_plate(scene) & (np.abs(verts[:, :2]) < HALF).all(1)
+    assert enough[before & (np.abs(verts[:, :2]) < 0.6 * HALF).all(1)].all()
+    assert not enough[~on_plate(scene)].any() and not enough[(np.abs(verts[:, :2]) > 1.5 * HALF).any(1)].any()
+    strict = OpeningConfig(points_share=1.1)
+    assert not openings(scene, scene.object_surface, clip, sights[1], strict).any()
