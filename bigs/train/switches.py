@@ -190,7 +190,7 @@ _INGREDIENTS = {
         _no_prior,
     ),
     "openings": Switch(
-        "openings of the object's mesh, through which hands are seen",
+        "openings of the object's mesh, through which hands or points are seen",
         lambda config: replace(config, openings=None),
     ),
     "smooth": Switch(

@@ -229,7 +229,7 @@ class RunConfig:
     # Eq. 8's distance of centres, or the distance of surfaces where the image shows touch.
     contact: Literal["center", "surface"] = "surface"
     prior: PriorConfig = field(default_factory=PriorConfig)
-    # Open the object's mesh where hands are seen through it; None leaves it closed.
+    # Open the object's mesh where hands or points are seen through it; None leaves it closed.
     openings: OpeningConfig | None = field(default_factory=OpeningConfig)
     # Files with VGG-16 (and LPIPS's channel weights) for the term "perceptual"; without them it is off.
     perceptual_weights: tuple[str, ...] = ()
