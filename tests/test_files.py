@@ -118,7 +118,8 @@ HOSTILE_YAML = {
     "laughs": (laughs(12), f"at most {MAX_YAML_NODES} values with its aliases"),
     "deep aliases": (laughs(45, each=1), f"at most {MAX_DEPTH} levels|"),
     "merges": (merges(40), f"at most {MAX_YAML_NODES} values with its aliases"),
-    "deep": ("[" * 100_000, "levels"),
+    # Newer parsers have a limit of their own.
+    "deep": ("[" * 100_000, "levels|maximum nesting depth"),
     "deep mapping": ("".join(" " * i + "a:\n" for i in range(200)), "levels"),
     "itself": ("a: &a [*a]", "expected aliases after their anchors"),
     "digits": (f"a: {'9' * 5000}", "expected YAML, found|digits"),
@@ -157,7 +158,8 @@ def test_honest_aliases_stay(tmp_path: Path) -> None:
 
 
 HOSTILE_JSON = {
-    "deep": ("[" * 100_000, "levels"),
+    # Newer parsers have a limit of their own.
+    "deep": ("[" * 100_000, "levels|maximum nesting depth"),
     "deep and closed": ("[" * 200 + "]" * 200, "levels"),
     "deep mappings": ('{"a":' * 300 + "1" + "}" * 300, "levels"),
     "5000 digits": ("9" * 5000, "expected JSON, found"),
