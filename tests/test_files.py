@@ -158,8 +158,7 @@ def test_honest_aliases_stay(tmp_path: Path) -> None:
 
 
 HOSTILE_JSON = {
-    # Newer parsers have a limit of their own.
-    "deep": ("[" * 100_000, "levels|maximum nesting depth"),
+    "deep": ("[" * 100_000, "levels"),
     "deep and closed": ("[" * 200 + "]" * 200, "levels"),
     "deep mappings": ('{"a":' * 300 + "1" + "}" * 300, "levels"),
     "5000 digits": ("9" * 5000, "expected JSON, found"),

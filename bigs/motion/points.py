@@ -26,19 +26,25 @@ def normalisation(points: np.ndarray) -> np.ndarray:
 
 def color_points(map_: ObjectMap, tracks: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:
     """Colours [N, 3] uint8 of the points `tracks` [N]: the median over their observations' pixels."""
-    slot = np.full(len(map_.points), -1)
-    slot[tracks] = np.arange(len(tracks))
-    rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))
+    rows, index = _observations(map_, tracks)
     column, row = np.floor(map_.pixels[rows]).astype(int).T
     found = np.empty((len(rows), 3))
     for t in np.unique(map_.frame[rows]):
         here = map_.frame[rows] == t
         height, width = images[t].shape[:2]
         found[here] = images[t][row[here].clip(0, height - 1), column[here].clip(0, width - 1)]
-    order = np.argsort(slot[map_.track[rows]], kind="stable")
-    _, starts = np.unique(slot[map_.track[rows]][order], return_index=True)
+    order = np.argsort(index, kind="stable")
+    _, starts = np.unique(index[order], return_index=True)
     medians = [np.median(group, axis=0) for group in np.split(found[order], starts[1:])]
     return np.round(medians).astype(np.uint8).reshape(-1, 3)
+
+
+def _observations(map_: ObjectMap, tracks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The map's observations [M] of `tracks` [N] that are believed, and which of them each shows [M]."""
+    slot = np.full(len(map_.points), -1)
+    slot[tracks] = np.arange(len(tracks))
+    rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))
+    return rows, slot[map_.track[rows]]
 
 
 def sure_sightings(map_: ObjectMap, tracks: np.ndarray) -> np.ndarray:
@@ -47,10 +53,8 @@ def sure_sightings(map_: ObjectMap, tracks: np.ndarray) -> np.ndarray:
     A wrong match is rarely confirmed by many frames, and a point that was seen from one side alone may lie
     anywhere along its ray.
     """
-    slot = np.full(len(map_.points), -1)
-    slot[tracks] = np.arange(len(tracks))
-    rows = np.flatnonzero(map_.use() & (slot[map_.track] >= 0))
-    frame, index = map_.frame[rows], slot[map_.track[rows]]
+    rows, index = _observations(map_, tracks)
+    frame = map_.frame[rows]
     eyes = -np.einsum("tji,tj->ti", map_.rotations, map_.transl)
     rays = map_.points[map_.track[rows]] - eyes[frame]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

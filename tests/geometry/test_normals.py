@@ -1,4 +1,4 @@
-"""Normals of points, and their outer side: on a ball, on a thin plate, and on a box seen from one side."""
+"""Normals of points, and their outer side: on a ball, on a thin plate, and on a front behind a ball."""
 
 import numpy as np
 import scipy.ndimage
