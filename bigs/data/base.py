@@ -46,6 +46,11 @@ class ObjectTrack:
     transl: np.ndarray  # [T, 3] metres
     valid: np.ndarray  # [T] bool: there is an estimate; the others are filled from their neighbours
 
+    def middle(self) -> np.ndarray:
+        """The middle of the points in the object's own metric frame, [3]."""
+        middle = np.median(self.points, axis=0)
+        return self.metric_from_canon[:3, :3] @ middle + self.metric_from_canon[:3, 3]
+
     def points_world(self) -> np.ndarray:
         """The points in every frame, [T, N, 3] metres, world."""
         metric = self.points @ self.metric_from_canon[:3, :3].T + self.metric_from_canon[:3, 3]

@@ -111,6 +111,11 @@ class HandModel(nn.Module):
         """Joints [..., 16, 3] of the shape `betas` [..., 10] in the rest pose, metres."""
         return self.J_regressor @ self.rest_vertices(betas)
 
+    def rest_wrist(self, betas: np.ndarray) -> np.ndarray:
+        """The wrist joint [3] of the shape `betas` [10] in the rest pose, metres, in float64."""
+        shaped = self.v_template.double() + self.shapedirs.double() @ torch.as_tensor(betas).double()
+        return (self.J_regressor.double()[0] @ shaped).numpy()
+
     def corrective(self, hand_pose: Tensor) -> Tensor:
         """Offsets [T, V, 3] that finger rotations `hand_pose` [T, 15, 3, 3] add before skinning, metres."""
         return pose_corrective(self.posedirs, hand_pose)

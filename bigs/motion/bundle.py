@@ -90,14 +90,14 @@ def adjust(
         a little.
     """
     free = np.ones(len(bundle.rotations), dtype=bool) if free is None else free
-    problem = _problem(bundle, K, config, free, anchor)
+    problem = make_problem(bundle, K, config, free, anchor)
     damping = 1e-3
-    cost = _cost(problem, bundle)
+    cost = cost_of(problem, bundle)
     for _ in range(config.iterations):
-        system = _linearise(problem, bundle)
+        system = linearise_all(problem, bundle)
         for _ in range(6):
             candidate = _step(problem, bundle, system, damping)
-            new_cost = _cost(problem, candidate)
+            new_cost = cost_of(problem, candidate)
             if new_cost < cost:
                 break
             damping *= 8.0
@@ -116,8 +116,8 @@ def pose_covariances(bundle: Bundle, K: np.ndarray, config: BundleConfig, anchor
     itself has no part in it: it changes all poses alike and leaves the pictures alone.
     """
     frames = len(bundle.rotations)
-    problem = _problem(bundle, K, config, np.ones(frames, dtype=bool), anchor)
-    matrix = reduce(_linearise(problem, bundle), problem.seen, 0.0).matrix
+    problem = make_problem(bundle, K, config, np.ones(frames, dtype=bool), anchor)
+    matrix = reduce(linearise_all(problem, bundle), problem.seen, 0.0).matrix
     covariance = np.linalg.inv(matrix)
     # The gauge's effect on all poses: seven columns, weighted so that well-known frames fix it.
     gauge = np.zeros((frames, 6, 7))
@@ -138,8 +138,8 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
     To first order, for independent reprojection errors of `config.pixel_sigma`. The gauge has no part in it.
     """
     free = np.ones(len(bundle.rotations), dtype=bool)
-    problem = _problem(bundle, K, config, free, None)
-    reduced = reduce(_linearise(problem, bundle), problem.seen, 0.0)
+    problem = make_problem(bundle, K, config, free, None)
+    reduced = reduce(linearise_all(problem, bundle), problem.seen, 0.0)
     covariance = np.linalg.pinv(reduced.matrix, rcond=1e-10, hermitian=True)
     blocks = covariance.reshape(len(free), 6, len(free), 6)[:, :3, :, :3]
     own = np.einsum("titi->t", blocks)
@@ -149,7 +149,7 @@ def turn_uncertainties(bundle: Bundle, K: np.ndarray, config: BundleConfig) -> n
     return np.degrees(np.sqrt((own[:, None] + own - 2.0 * cross).clip(0.0)))
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """What stays the same from step to step."""
 
     seen: Observations
@@ -159,11 +159,12 @@ class _Problem(NamedTuple):
     anchor: Anchor | None
 
 
-def _problem(
+def make_problem(
     bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray, anchor: Anchor | None
-) -> _Problem:
+) -> Problem:
+    """What `adjust` minimises, with its arguments; `cost_of` and `linearise_all` evaluate it."""
     seen = sort_observations(bundle.frame, bundle.point, bundle.pixels, free)
-    return _Problem(seen, free, K, config, anchor)
+    return Problem(seen, free, K, config, anchor)
 
 
 def _in_camera(bundle: Bundle) -> np.ndarray:
@@ -193,7 +194,8 @@ def _leaving(squared: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]
     return squared * share, share**2
 
 
-def _cost(problem: _Problem, bundle: Bundle) -> float:
+def cost_of(problem: Problem, bundle: Bundle) -> float:
+    """The sum of all losses, twice the negative logarithm of a likelihood."""
     config = problem.config
     pixel, _ = _cauchy((bundle.residuals(problem.K) ** 2).sum(1) / config.pixel_sigma**2)
     turn, shift = _accelerations(bundle, config)
@@ -221,7 +223,7 @@ def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np
     )
 
 
-def _linearise(problem: _Problem, bundle: Bundle) -> System:
+def linearise_all(problem: Problem, bundle: Bundle) -> System:
     """Normal equations about `bundle`, the motion prior's part included."""
     frames = int(problem.free.sum())
     system = linearise(
@@ -240,7 +242,7 @@ def _linearise(problem: _Problem, bundle: Bundle) -> System:
     return system
 
 
-def _add_motion_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem) -> None:
+def _add_motion_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: Problem) -> None:
     """Add the motion prior's part in place. Steps are small, so turns are differenced as if they commuted."""
     config, free = problem.config, problem.free
     depth = float(np.median(bundle.transl[:, 2]))
@@ -260,7 +262,7 @@ def _add_motion_prior(poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, p
 
 
 def _add_anchor(
-    poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: _Problem, anchor: Anchor
+    poses: np.ndarray, gradient: np.ndarray, bundle: Bundle, problem: Problem, anchor: Anchor
 ) -> None:
     """Add the anchor's part in place."""
     free = problem.free
@@ -277,7 +279,7 @@ def _add_anchor(
 _SECOND = (1.0, -2.0, 1.0)
 
 
-def _step(problem: _Problem, bundle: Bundle, system: System, damping: float) -> Bundle:
+def _step(problem: Problem, bundle: Bundle, system: System, damping: float) -> Bundle:
     """One damped Gauss-Newton step."""
     reduced = reduce(system, problem.seen, damping)
     change = pose_steps(reduced)

@@ -63,6 +63,16 @@ class ObjectMap:
         self.known[:] = False
         self.triangulate()
 
+    def change_camera(self, K: np.ndarray, growth: float) -> None:
+        """Take other intrinsics, with depths times `growth`, as the focal length grows."""
+        self.K = K
+        further = np.array([1.0, 1.0, growth])
+        self.transl *= further
+        if self.anchor is not None:
+            self.anchor = self.anchor._replace(
+                transl=further * self.anchor.transl, shift_sigma=further * self.anchor.shift_sigma
+            )
+
     def settle(self, reaches: Sequence[float] = (3.0, 1.0)) -> None:
         """Bundle adjustment of all posed frames (which must be consecutive), from coarse to fine.
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from bigs.geometry.rotations import robust_mean_rotation
 from bigs.motion.bundle import Anchor, BundleConfig, pose_covariances
 from bigs.motion.features import FeatureConfig, FrameFeatures, extract_features
+from bigs.motion.focal import FocalConfig, believed_focal, scaled_focal
 from bigs.motion.follow import FollowConfig, follow
 from bigs.motion.models import MappingConfig, match_features
 from bigs.motion.object_map import MapConfig, ObjectMap
@@ -42,6 +43,7 @@ class TrackerConfig:
     follow: FollowConfig = field(default_factory=FollowConfig)
     map: MapConfig = field(default_factory=MapConfig)
     patches: PatchConfig = field(default_factory=lambda: PatchConfig(passes=2))
+    focal: FocalConfig = field(default_factory=FocalConfig)
     # Each frame is matched with this many later ones, ...
     overlap: int = 6
     # ... and with up to this many others whose rotation differs by less than this, degrees.
@@ -91,6 +93,8 @@ class TrackedMotion(NamedTuple):
     sightings: np.ndarray  # [M, 2] frame and index of each sighting of the points whose place is sure
     turn_sigma: float  # estimated error of the given rotations, radians
     shift_sigma: np.ndarray  # [3] the same of positions, metres
+    focal: float  # factor on the given focal length; all the above is seen through the longer or shorter one
+    focal_sigma: float  # its standard deviation
 
 
 def track(
@@ -137,6 +141,9 @@ def track_matches(
     polish(map_, config.rounds)
     sharpen(map_, Pictures(images, masks, config.patches), config.patches)
 
+    focal = believed_focal(map_.bundle(frames)[0], K, config.map.bundle, config.focal)
+    K = scaled_focal(K, focal.factor)
+    map_.change_camera(K, focal.factor)
     map_.anchor = measured_anchor(map_, map_.anchor, config)
     uncertain = _fused(map_, config)
     bundle, _ = map_.bundle(frames)
@@ -161,6 +168,8 @@ def track_matches(
         sure_sightings(map_, used),
         map_.anchor.turn_sigma,
         map_.anchor.shift_sigma,
+        focal.factor,
+        focal.sigma,
     )
 
 

@@ -12,6 +12,7 @@ import torch
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.data.focal import with_focal_factor
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights
@@ -116,6 +117,9 @@ def fit(
     if config.stages and isinstance(config.stages[0], ObjectMotionStage):
         watch.begin(config.stages[0].name)
         motion = _object_motion(clip, config, config.stages[0], checkpoints, report, listen)
+        if motion is not None:
+            wrists = {side: hand_models[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
+            clip = with_focal_factor(clip, wrists, motion.focal)
         watch.begin("start values")
     unknown = occluders.result()
     targets = TargetSource(clip, unknown)

@@ -167,6 +167,13 @@ def _free_frames(config: RunConfig) -> RunConfig:
     )
 
 
+def _calibrated(stage: Stage) -> Stage:
+    if not isinstance(stage, ObjectMotionStage):
+        return stage
+    focal = replace(stage.tracker.focal, calibrated=1.0)
+    return replace(stage, tracker=replace(stage.tracker, focal=focal))
+
+
 def _pyramid(config: RunConfig) -> RunConfig:
     sizes = [stage.image_size for stage in config.stages if isinstance(stage, OptimizeStage)]
     finest = 0 if 0 in sizes else max(sizes, default=0)
@@ -205,6 +212,10 @@ _INGREDIENTS = {
     "object-motion": Switch(
         "the object's motion from tracks in its pictures",
         lambda config: _keep(config, leave_out=ObjectMotionStage),
+    ),
+    "focal": Switch(
+        "the focal length from the object's tracks: the clip's own is then taken as calibrated",
+        lambda config: replace(config, stages=tuple(map(_calibrated, config.stages))),
     ),
     "object_smooth": Switch(
         "the object's motion: the smoothing of its estimates, and acceleration",

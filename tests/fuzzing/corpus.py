@@ -14,7 +14,6 @@ import yaml
 
 from bigs.cli import main
 from bigs.colmap import pycolmap
-from bigs.commands.clips.convert import rest_wrist
 from bigs.data.formats.hold import load_hold
 from bigs.data.formats.writers import CV_FROM_GL, write_arctic, write_colmap, write_ho3d, write_nerfstudio
 from bigs.data.ground_truth import load_annotation
@@ -159,7 +158,7 @@ def _write_hand_models(folder: Path, hand: HandModel) -> None:
 def _write_layouts(folder: Path, path: Path) -> None:
     """The clip as structure from motion leaves it, and its truth as data sets have it."""
     clip, hands = load_hold(path), load_hand_models(None)
-    wrists = {side: rest_wrist(hands[side], track.betas) for side, track in clip.hands.items()}
+    wrists = {side: hands[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
     assert clip.object is not None
     still = replace(
         clip,
@@ -183,7 +182,7 @@ def _write_layouts(folder: Path, path: Path) -> None:
     annotation = replace(annotation, object=few)
     images = [clip.image(t) for t in range(len(clip))]
     write_arctic(folder / "arctic", annotation, subject="s01", sequence="box_grab_01", images=images)
-    wrists = {side: rest_wrist(hands[side], track.betas) for side, track in annotation.hands.items()}
+    wrists = {side: hands[side].rest_wrist(track.betas) for side, track in annotation.hands.items()}
     write_ho3d(
         folder / "ho3d",
         in_world(annotation, np.linalg.inv(CV_FROM_GL), wrists),

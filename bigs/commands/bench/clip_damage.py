@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +12,9 @@ import scipy.ndimage
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bigs.commands.clips.convert import rest_wrist, write_build_clip
+from bigs.commands.clips.convert import write_build_clip
 from bigs.data.base import Clip, HandTrack, ObjectTrack
+from bigs.data.focal import with_focal_factor
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, Side
 
@@ -85,9 +86,9 @@ def write_damaged(
     poses, pictures, labels = (np.random.default_rng([seed, part]) for part in range(3))
     count = len(clip)
     worse = _with_outliers(clip, damage.outliers, poses)
-    K = clip.K.copy()
-    K[:2, :2] *= damage.focal
-    worse = _with_depths(worse, hand_models, damage.focal)
+    # What estimators tell that were told a longer focal length.
+    wrists = {side: hand_models[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
+    worse = with_focal_factor(worse, wrists, damage.focal)
     without, swapped = (_some(count, share, labels) for share in (damage.maskless, damage.swapped))
     gains = _wavering(count, damage.exposure, pictures)
 
@@ -107,7 +108,7 @@ def write_damaged(
                 found[right], found[left] = MASK_VALUES["left"], MASK_VALUES["right"]
             yield np.zeros_like(found) if without[t] else found
 
-    return write_build_clip(worse, folder, hand_models, K, images(), masks())
+    return write_build_clip(worse, folder, hand_models, worse.K, images(), masks())
 
 
 def as_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
@@ -183,13 +184,14 @@ def _with_outliers(clip: Clip, share: float, rng: np.random.Generator) -> Clip:
 
     def turned_object(track: ObjectTrack) -> ObjectTrack:
         hit, turns, shifts = _gross(len(clip), share, rng)
-        middle = _middle(track)
+        middle = track.middle()
         rotations = np.where(hit[:, None, None], turns.as_matrix() @ track.rotations, track.rotations)
         # About its own middle, so that a wrong estimate stays where the mask is.
         transl = track.transl + (track.rotations - rotations) @ middle + hit[:, None] * shifts
         return replace(track, rotations=rotations, transl=transl)
 
-    return _changed(clip, turned_hand, turned_object)
+    hands = {side: turned_hand(side, track) for side, track in clip.hands.items()}
+    return replace(clip, hands=hands, object=None if clip.object is None else turned_object(clip.object))
 
 
 def _gross(count: int, share: float, rng: np.random.Generator) -> tuple[np.ndarray, Rotation, np.ndarray]:
@@ -201,36 +203,3 @@ def _gross(count: int, share: float, rng: np.random.Generator) -> tuple[np.ndarr
     ways = rng.standard_normal((count, 3))
     shifts = rng.uniform(*_GROSS_SHIFT, count)[:, None] * ways / np.linalg.norm(ways, axis=1, keepdims=True)
     return hit, turns, shifts
-
-
-def _with_depths(clip: Clip, hand_models: Mapping[Side, HandModel], factor: float) -> Clip:
-    """Every subject's depth times a factor: what estimators tell that were told a longer focal length."""
-
-    def away(points_world: np.ndarray) -> np.ndarray:
-        rotation = clip.cam_from_world[:, :3, :3]
-        depth = np.einsum("tj,tj->t", rotation[:, 2], points_world) + clip.cam_from_world[:, 2, 3]
-        return (factor - 1.0) * depth[:, None] * rotation[:, 2]
-
-    def hand(side: Side, track: HandTrack) -> HandTrack:
-        wrist = rest_wrist(hand_models[side], track.betas) + track.transl
-        return replace(track, transl=track.transl + away(wrist))
-
-    def obj(track: ObjectTrack) -> ObjectTrack:
-        return replace(track, transl=track.transl + away(track.rotations @ _middle(track) + track.transl))
-
-    return _changed(clip, hand, obj)
-
-
-def _changed(
-    clip: Clip,
-    hand: Callable[[Side, HandTrack], HandTrack],
-    obj: Callable[[ObjectTrack], ObjectTrack],
-) -> Clip:
-    hands = {side: hand(side, track) for side, track in clip.hands.items()}
-    return replace(clip, hands=hands, object=None if clip.object is None else obj(clip.object))
-
-
-def _middle(track: ObjectTrack) -> np.ndarray:
-    """The middle of the object's points in its own metric frame, [3]."""
-    middle = np.median(track.points, axis=0)
-    return track.metric_from_canon[:3, :3] @ middle + track.metric_from_canon[:3, 3]

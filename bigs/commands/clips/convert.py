@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 import trimesh
 from PIL import Image
 
@@ -139,7 +138,7 @@ def write_build_clip(
         K=K,
         normalize_shift=clip.normalize_shift,
         hands={
-            side: move_hand(track, motions, rest_wrist(hand_models[side], track.betas))
+            side: move_hand(track, motions, hand_models[side].rest_wrist(track.betas))
             for side, track in clip.hands.items()
         },
         object=None if clip.object is None else move_object(clip.object, motions),
@@ -152,7 +151,7 @@ def _write_truth(
     in_camera = in_world(
         truth,
         truth.cam_from_world,
-        {side: rest_wrist(hand_models[side], track.betas) for side, track in truth.hands.items()},
+        {side: hand_models[side].rest_wrist(track.betas) for side, track in truth.hands.items()},
     )
     size, K = _resized(truth.width, truth.height, truth.K, width)
     posed = pose_annotation(truth, hand_models)
@@ -178,12 +177,6 @@ def _write_truth(
     if bends:
         notes.append(("object", "it bends, so gt.npz has the hands only; score against the data set itself"))
     return notes
-
-
-def rest_wrist(model: HandModel, betas: np.ndarray) -> np.ndarray:
-    """The rest wrist joint [3] of a shape, metres."""
-    shaped = model.v_template.double() + model.shapedirs.double() @ torch.as_tensor(betas).double()
-    return (model.J_regressor.double()[0] @ shaped).numpy()
 
 
 def _resized(width: int, height: int, K: np.ndarray, wanted: int) -> tuple[tuple[int, int], np.ndarray]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import torch
-
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.formats.layouts import load_clip
@@ -24,10 +22,7 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
         InputError: the clip is invalid or implausible.
     """
     clip = load_clip(path, hand_models["right"].hands_mean.double().numpy())
-    wrists = {
-        side: hand_models[side].rest_joints(torch.as_tensor(track.betas, dtype=torch.float32))[0].numpy()
-        for side, track in clip.hands.items()
-    }
+    wrists = {side: hand_models[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
     clip = plausible(clip, wrists)
     if clip.annotated:
         return clip

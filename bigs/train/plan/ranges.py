@@ -12,6 +12,7 @@ from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.motion.bundle import BundleConfig
 from bigs.motion.features import FeatureConfig
+from bigs.motion.focal import FocalConfig
 from bigs.motion.follow import FollowConfig
 from bigs.motion.object_map import MapConfig
 from bigs.motion.patches import PatchConfig
@@ -125,6 +126,11 @@ RANGES: dict[type, dict[str, Range]] = {
         "max_features": _COUNT,
     },
     FollowConfig: {"levels": _COUNT, "half": Range(1, 100), "guides": _COUNT},
+    FocalConfig: {
+        "calibrated": _SHARE,
+        **dict.fromkeys(("calibrated_sigma", "guessed_sigma", "pixel_sigma", "caution"), _POSITIVE),
+        "most_observations": _COUNT,
+    },
     MapConfig: {"keep_error": _POSITIVE, "least_observations": Range(2, 10**6)},
     PatchConfig: {"max_side": Range(16, 1 << 16), "half": Range(1, 100), "neighbours": Range(3, 1000)},
     BundleConfig: {

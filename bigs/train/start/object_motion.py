@@ -93,6 +93,8 @@ def in_words(motion: TrackedMotion) -> str:
         f"{len(motion.points)} points, rotation known to {np.median(error):.2f} degrees (given to "
         f"{np.degrees(motion.turn_sigma):.2f})"
     )
+    if motion.focal != 1.0:
+        text = f"{text}, focal length x {motion.focal:.3f} +- {motion.focal_sigma:.3f}"
     wrong = np.flatnonzero(motion.contradicted)
     return f"{text}, refuted in frames {', '.join(map(str, wrong))}" if len(wrong) else text
 
@@ -117,4 +119,8 @@ def _read(file: Path, digest: str) -> TrackedMotion | None:
             values = {name: stored[name] for name in TrackedMotion._fields}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return TrackedMotion(**values | {"turn_sigma": float(values["turn_sigma"])})
+    return TrackedMotion(**values | {name: float(values[name]) for name in _NUMBERS})
+
+
+# Fields of `TrackedMotion` that are numbers.
+_NUMBERS = ("turn_sigma", "focal", "focal_sigma")

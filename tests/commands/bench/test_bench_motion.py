@@ -34,6 +34,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, GivenPoses]
             np.zeros((0, 2), dtype=int),
             0.02,
             np.full(3, 0.003),
+            1.0,
+            0.005,
         )
 
     monkeypatch.setattr(bench_motion, "track", track)

@@ -28,15 +28,18 @@ from bigs.types import Side
 STAGE = ObjectMotionStage()
 
 
+FOCAL = 0.95
+
+
 def tracked(given: GivenPoses, turn: float = 2e-3) -> TrackedMotion:
-    """The given poses a little aside, known well but for the last frame."""
+    """The given poses a little aside, known well but for the last frame, through a shorter lens."""
     count = len(given.rotations)
     aside = axis_angle_to_matrix(torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)).numpy()
     covariance = np.tile(np.diag([turn**2] * 3 + [1e-8] * 3), (count, 1, 1))
     covariance[-1] *= 400.0
     return TrackedMotion(
         aside @ given.rotations,
-        given.transl,
+        given.transl * [1.0, 1.0, FOCAL],
         covariance,
         np.full(count, 100),
         np.zeros(count, dtype=bool),
@@ -45,6 +48,8 @@ def tracked(given: GivenPoses, turn: float = 2e-3) -> TrackedMotion:
         np.zeros((0, 2), dtype=int),
         0.02,
         np.full(3, 0.003),
+        FOCAL,
+        0.01,
     )
 
 
@@ -125,6 +130,20 @@ def test_a_run_that_goes_on_ends_in_the_same_bytes(
     turns = whole.object_poses.turn_freedom @ whole.object_poses.orient.detach()[..., None]
     assert turns[:-1].norm(dim=1).max() < 0.1 * 4 * 1e-3
     assert whole.object_poses.turn_freedom[-1].allclose(torch.eye(3))
+
+
+def test_a_run_goes_on_with_the_focal_length_of_the_tracks(
+    tiny: Clip, both_hands: dict[Side, HandModel], calls: list[GivenPoses]
+) -> None:
+    """The hands come nearer as the object does, and stay where they are seen."""
+    scenes = [fit(tiny, both_hands, replace(SMOKE, stages=stages))[0] for stages in ((), (STAGE,))]
+    lens = torch.tensor([[FOCAL], [FOCAL], [1.0]]) * torch.eye(3) + (1 - torch.eye(3))
+    torch.testing.assert_close(scenes[1].K, lens * scenes[0].K)
+    frames = torch.arange(len(tiny))
+    for side in scenes[0].hand_poses:
+        before, after = (scene.hand_poses[side](frames).wrist for scene in scenes)
+        torch.testing.assert_close(after[:, 2], FOCAL * before[:, 2])
+        torch.testing.assert_close(after[:, :2], before[:, :2])
 
 
 def test_it_can_be_left_out_and_stands_first_where_it_is() -> None:

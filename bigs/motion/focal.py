@@ -1,0 +1,214 @@
+"""The focal length that tracks of a turning object tell, weighed against the one that was given.
+
+A longer focal length and a greater depth change a picture only by its perspective: near parts of an object
+grow less. Over the frames of a clip that is enough to tell the focal length to a few per cent. One from a
+calibration is better than that, and one that somebody guessed is often worse. Both may have been given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from bigs.motion.bundle import Bundle, BundleConfig, Problem, cost_of, linearise_all, make_problem
+from bigs.motion.schur import Observations, Reduced, System, point_steps, reduce
+
+
+@dataclass(frozen=True)
+class FocalConfig:
+    """What is believed of a given focal length, and how it is measured. Errors are shares of its length."""
+
+    # Chance that the given one was calibrated, the usual error then, and that of a guess. With a chance of 1
+    # nothing is measured.
+    calibrated: float = 0.75
+    calibrated_sigma: float = 0.005
+    guessed_sigma: float = 0.08
+    # Standard deviation of a reprojection error, pixels: below the real one, since what is off by more leans
+    # to one side.
+    pixel_sigma: float = 0.07
+    iterations: int = 40
+    # More observations than this add time and no certainty, and fewer do not tell a focal length.
+    most_observations: int = 20_000
+    least_observations: int = 1000
+    # Errors of tracks are correlated: true errors are so many times those of independent ones, and never
+    # less than `least_sigma`.
+    caution: float = 5.0
+    least_sigma: float = 0.02
+
+
+class FocalLength(NamedTuple):
+    """Both as shares of the given focal length."""
+
+    factor: float  # on the given focal length
+    sigma: float  # standard deviation of the factor
+
+
+def believed_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: FocalConfig) -> FocalLength:
+    """The focal length after tracks were heard.
+
+    The given one counts as calibrated or guessed, each as likely as it makes what was measured.
+
+    Args:
+        bundle: poses, points and observations, adjusted with the given focal length.
+        K: [3, 3] given intrinsics.
+        scales: the motion prior.
+        config: see there.
+    """
+    calibrated, guessed = config.calibrated_sigma, config.guessed_sigma
+    if config.calibrated >= 1.0 or len(bundle.frame) < config.least_observations:
+        return FocalLength(1.0, calibrated)
+    measured = measured_focal(bundle, K, scales, config)
+    if not np.isfinite(measured.sigma):
+        return FocalLength(1.0, calibrated)
+    growth, variance = np.log(measured.factor), measured.sigma**2
+    means, variances, likely = [], [], []
+    for sigma, chance in ((calibrated, config.calibrated), (guessed, 1.0 - config.calibrated)):
+        total = sigma**2 + variance
+        means.append(sigma**2 / total * growth)
+        variances.append(sigma**2 * variance / total)
+        likely.append(np.log(max(chance, 1e-12)) - 0.5 * growth**2 / total - 0.5 * np.log(total))
+    share = np.exp(np.array(likely) - max(likely))
+    share /= share.sum()
+    mean = float(share @ means)
+    spread = float(share @ (np.array(variances) + (np.array(means) - mean) ** 2))
+    return FocalLength(float(np.exp(mean)), float(np.sqrt(spread)))
+
+
+def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: FocalConfig) -> FocalLength:
+    """What tracks alone say, by bundle adjustment with the focal length among the unknowns.
+
+    `sigma` is infinite where they say nothing.
+    """
+    scales = replace(scales, pixel_sigma=config.pixel_sigma)
+    bundle = _thinned(bundle, config.most_observations)
+    free = np.ones(len(bundle.rotations), dtype=bool)
+    problem = make_problem(bundle, K, scales, free, None)
+    growth, damping, sigma = 0.0, 1e-3, np.inf
+    cost = cost_of(problem, bundle)
+    for _ in range(config.iterations):
+        system = linearise_all(problem, bundle)
+        border = _border(problem, bundle)
+        for _ in range(6):
+            step = _step(system, problem.seen, border, damping)
+            if not step.stiffness > 0.0:
+                return FocalLength(float(np.exp(growth)), np.inf)
+            candidate = bundle._replace(
+                rotations=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ bundle.rotations,
+                transl=bundle.transl + step.poses[:, 3:],
+                points=_moved(bundle.points, problem.seen, step.points),
+            )
+            nearer = problem._replace(K=scaled_focal(K, np.exp(growth + step.growth)))
+            new_cost = cost_of(nearer, candidate)
+            if new_cost < cost:
+                break
+            damping *= 8.0
+        else:
+            break
+        sigma = config.caution / np.sqrt(step.stiffness)
+        gain, cost, bundle, problem = cost - new_cost, new_cost, candidate, nearer
+        growth, damping = growth + step.growth, max(damping / 6.0, 1e-6)
+        if gain < scales.tolerance * cost:
+            break
+    return FocalLength(float(np.exp(growth)), float(np.hypot(sigma, config.least_sigma)))
+
+
+def scaled_focal(K: np.ndarray, factor: float) -> np.ndarray:
+    """Intrinsics [3, 3] with both focal lengths times `factor`."""
+    changed = K.copy()
+    changed[[0, 1], [0, 1]] *= factor
+    return changed
+
+
+class _Border(NamedTuple):
+    """The focal length's part of the normal equations, for the logarithm of a factor on it."""
+
+    poses: np.ndarray  # [6T] its coupling with the poses
+    points: np.ndarray  # [P, 3] with the points, by rank
+    stiffness: float
+    gradient: float
+
+
+class _Step(NamedTuple):
+    poses: np.ndarray  # [T, 6]
+    points: np.ndarray  # [P, 3] by rank
+    growth: float  # of the focal length's logarithm
+    stiffness: float  # second derivative of the cost by it, everything else following
+
+
+def _border(problem: Problem, bundle: Bundle) -> _Border:
+    seen, K, sigma = problem.seen, problem.K, problem.config.pixel_sigma
+    rotation = bundle.rotations[seen.frame]
+    arm = np.einsum("mij,mj->mi", rotation, bundle.points[seen.points][seen.point])
+    place = arm + bundle.transl[seen.frame]
+    depth = np.where(place[:, 2] > 1e-6, place[:, 2], 1e-6)[:, None]
+    ray = place[:, :2] / depth
+    focal = K[[0, 1], [0, 1]]
+    grown = focal * ray  # derivative of the pixel
+    off = grown + K[:2, 2] - seen.pixels.T
+    weight = 1.0 / (sigma**2 + (off**2).sum(1))
+    across = weight[:, None] * focal / depth * grown
+    pull = np.concatenate([across, -(ray * across).sum(1, keepdims=True)], axis=1)  # by the place
+    starts = np.concatenate([batch.starts + batch.rows.start for batch in seen.batches])
+    by_pose = np.concatenate([np.cross(arm, pull), pull], axis=1)
+    frames = len(bundle.rotations)
+    return _Border(
+        np.stack([np.bincount(seen.frame, by_pose[:, i], frames) for i in range(6)], axis=1).ravel(),
+        np.add.reduceat(np.einsum("mji,mj->mi", rotation, pull), starts, axis=0),
+        float(weight @ (grown**2).sum(1)),
+        float(weight @ (grown * off).sum(1)),
+    )
+
+
+def _step(system: System, seen: Observations, border: _Border, damping: float) -> _Step:
+    """A damped step of everything: points eliminated first, then poses, then the focal length."""
+    reduced = reduce(system, seen, damping)
+    column, stiffness, gradient = border.poses.copy(), border.stiffness, border.gradient
+    for batch, part, inverse in zip(seen.batches, system.parts, reduced.inverses, strict=True):
+        own = border.points[batch.points]
+        held = np.einsum("nij,nj->ni", inverse, own)
+        stiffness -= float((held * own).sum())
+        gradient -= float((held * part.gradient).sum())
+        slots = 6 * batch.slots[batch.slot]
+        for i in range(6):
+            values = (part.coupling[i] * held[batch.point].T).sum(0)
+            column -= np.bincount(slots + i, values, len(column))
+    poses, follows = scipy.linalg.solve(
+        reduced.matrix, np.stack([-reduced.gradient, -column], axis=1), assume_a="sym"
+    ).T
+    stiffness += float(column @ follows)
+    growth = -(gradient + float(column @ poses)) / stiffness if stiffness > 0.0 else 0.0
+    change = (poses + growth * follows).reshape(-1, 6)
+    return _Step(change, _points_following(system, seen, reduced, border, change, growth), growth, stiffness)
+
+
+def _points_following(
+    system: System, seen: Observations, reduced: Reduced, border: _Border, change: np.ndarray, growth: float
+) -> np.ndarray:
+    pulled = [
+        part._replace(gradient=part.gradient + growth * border.points[batch.points])
+        for batch, part in zip(seen.batches, system.parts, strict=True)
+    ]
+    return point_steps(system._replace(parts=pulled), reduced, seen, change)
+
+
+def _thinned(bundle: Bundle, most: int) -> Bundle:
+    """Points at random, with all their observations, of which about `most` remain."""
+    seen = np.bincount(bundle.point, minlength=len(bundle.points))
+    order = np.random.default_rng(0).permutation(len(seen))
+    kept = np.zeros(len(seen), dtype=bool)
+    kept[order[np.cumsum(seen[order]) <= most]] = True
+    rows = kept[bundle.point]
+    used, point = np.unique(bundle.point[rows], return_inverse=True)
+    return bundle._replace(
+        points=bundle.points[used], frame=bundle.frame[rows], point=point, pixels=bundle.pixels[rows]
+    )
+
+
+def _moved(points: np.ndarray, seen: Observations, steps: np.ndarray) -> np.ndarray:
+    moved = points.copy()
+    moved[seen.points] += steps
+    return moved

@@ -1,0 +1,119 @@
+"""The focal length among the unknowns: against dense equations, and exact and noisy scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from turning_object import K, turning_object
+
+from bigs.motion.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.focal import FocalConfig, FocalLength, believed_focal, measured_focal, scaled_focal
+
+SCALES = BundleConfig(iterations=60, tolerance=1e-9)
+# Errors of tracks as they are told apart, without what is added for those of real ones.
+BARE = FocalConfig(caution=1.0, least_sigma=0.0, pixel_sigma=0.15, least_observations=100)
+
+
+def seen_through(factor: float, noise: float, frames: int = 30, seed: int = 0) -> Bundle:
+    """A turning egg, adjusted with a focal length that is `factor` times the true one."""
+    egg = turning_object(frames=frames, points=250, noise=noise, seed=seed)
+    frame = np.concatenate([np.full(len(ids), t) for t, ids in enumerate(egg.ids)])
+    point = np.concatenate(egg.ids)
+    often = np.bincount(point, minlength=len(egg.points))[point] >= 4
+    used, point = np.unique(point[often], return_inverse=True)
+    pixels = np.concatenate([features.pixels for features in egg.features])[often]
+    further = egg.transl * [1.0, 1.0, factor]
+    start = Bundle(egg.rotations, further, egg.points[used], frame[often], point, pixels)
+    return adjust(start, scaled_focal(K, factor), replace(SCALES, iterations=8))
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.06])
+def test_exact_tracks_tell_the_focal_length(factor: float) -> None:
+    found = measured_focal(seen_through(factor, 0.0), scaled_focal(K, factor), SCALES, BARE)
+    assert found.factor * factor == pytest.approx(1.0, abs=2e-3)
+    assert found.sigma < 0.02
+
+
+def test_the_error_told_is_the_error_made() -> None:
+    off, told = [], []
+    for seed in range(6):
+        found = measured_focal(seen_through(1.0, 0.15, seed=seed), K, SCALES, BARE)
+        off.append(np.log(found.factor))
+        told.append(found.sigma)
+    usual = float(np.sqrt(np.mean(np.square(off))))
+    assert 0.3 * np.mean(told) < usual < 2.0 * np.mean(told)
+
+
+def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One step from a start that is off, against the normal equations of finite differences."""
+    import bigs.motion.focal as focal
+    import bigs.motion.schur as schur
+
+    monkeypatch.setattr(schur, "_BATCH", 200)
+    whole = seen_through(1.0, 0.3, frames=6)
+    bundle = focal._thinned(whole, 150)
+    assert 80 < len(bundle.frame) <= 150
+    scales = replace(SCALES, pixel_sigma=0.5, turn_sigma=1e4, shift_sigma=1e3)  # no prior to speak of
+    problem = focal.make_problem(bundle, K, scales, np.ones(6, dtype=bool), None)
+    step = focal._step(
+        focal.linearise_all(problem, bundle), problem.seen, focal._border(problem, bundle), 1e-2
+    )
+
+    residual = bundle.residuals(K)
+    weight = np.sqrt(1.0 / (0.5**2 + (residual**2).sum(1)))[:, None]
+    poses, count = 6 * 6, 6 * 6 + bundle.points.size + 1
+
+    def moved(change: np.ndarray) -> np.ndarray:
+        turned = focal.Rotation.from_rotvec(change[:poses].reshape(6, 6)[:, :3]).as_matrix()
+        there = bundle._replace(
+            rotations=turned @ bundle.rotations,
+            transl=bundle.transl + change[:poses].reshape(6, 6)[:, 3:],
+            points=bundle.points + change[poses:-1].reshape(-1, 3),
+        )
+        return (there.residuals(scaled_focal(K, np.exp(change[-1]))) * weight).ravel()
+
+    jacobian = np.stack([(moved(d) - moved(-d)) / 2e-6 for d in 1e-6 * np.eye(count)], axis=1)
+    matrix, gradient = jacobian.T @ jacobian, jacobian.T @ (residual * weight).ravel()
+    matrix[np.diag_indices(count - 1)] *= 1.0 + 1e-2  # the focal length itself is not damped
+    change = np.linalg.solve(matrix, -gradient)
+    assert step.growth == pytest.approx(change[-1], rel=1e-3)
+    np.testing.assert_allclose(step.poses.ravel(), change[:poses], atol=1e-3 * np.abs(change).max())
+    places = np.empty_like(bundle.points)
+    places[problem.seen.points] = step.points
+    np.testing.assert_allclose(places.ravel(), change[poses:-1], atol=1e-3 * np.abs(change).max())
+    assert step.stiffness == pytest.approx(1.0 / np.linalg.inv(matrix)[-1, -1], rel=1e-3)
+
+
+def believed(measured: FocalLength, config: FocalConfig, monkeypatch: pytest.MonkeyPatch) -> FocalLength:
+    monkeypatch.setattr("bigs.motion.focal.measured_focal", lambda *_: measured)
+    many = np.zeros(2000, dtype=int)
+    bundle = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((1, 3)), many, many, np.zeros((len(many), 2)))
+    return believed_focal(bundle, K, SCALES, config)
+
+
+def test_a_small_contradiction_is_an_error_of_tracks_and_a_large_one_a_guess(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = FocalConfig()
+    factors = [
+        believed(FocalLength(np.exp(-off), 0.025), config, monkeypatch).factor
+        for off in (0.0, 0.01, 0.03, 0.06, 0.1, 0.2)
+    ]
+    assert factors[0] == pytest.approx(1.0)
+    assert factors[1] > 0.998
+    assert factors[3] < 0.97
+    assert factors[4:] == pytest.approx(np.exp([-0.1, -0.2]), rel=0.02)
+    assert all(np.diff(factors) < 0)
+    # Who errs in doubt says so.
+    doubtful = believed(FocalLength(0.95, 0.025), config, monkeypatch)
+    assert doubtful.sigma > 2 * believed(FocalLength(1.0, 0.025), config, monkeypatch).sigma
+
+
+def test_a_calibrated_camera_and_too_few_tracks_keep_what_was_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = FocalLength(0.8, 0.01)
+    assert believed(wrong, FocalConfig(calibrated=1.0), monkeypatch).factor == 1.0
+    assert believed(wrong, FocalConfig(least_observations=3000), monkeypatch).factor == 1.0
+    assert believed(FocalLength(0.8, np.inf), FocalConfig(), monkeypatch).factor == 1.0
+    assert believed(wrong, FocalConfig(calibrated=0.0), monkeypatch).factor == pytest.approx(0.8, rel=0.01)
