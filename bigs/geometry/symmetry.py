@@ -71,6 +71,12 @@ class Symmetry:
             for matrix in matrices
         ]
 
+    def mirrored(self, plane: Symmetry) -> Symmetry:
+        """What a mirror plane makes of it."""
+        normal = plane.direction
+        point = self.point - 2.0 * ((self.point - plane.point) @ normal) * normal
+        return Symmetry(self.kind, point, self.direction - 2.0 * (self.direction @ normal) * normal)
+
     def moved(self, x: np.ndarray, size: float) -> Symmetry:
         """A plane shifted by x[1] * size along its normal, an axis by x[:2] * size; turned by x[2:]."""
         first, second = across(self.direction)

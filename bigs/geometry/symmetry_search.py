@@ -44,7 +44,7 @@ class SymmetryConfig:
     # Smallest share of support in support and contradiction together, for the first symmetry and for those
     # after it: what the first has completed supports a wrong one as well as a right one.
     least_share: float = 0.85
-    least_share_later: float = 0.97
+    least_share_later: float = 0.96
     # Largest share of contradiction, absolute and relative to the support: where much was seen, wrong poses
     # and masks contradict everywhere a little.
     most_contradiction: float = 0.06
@@ -185,6 +185,21 @@ class _Judge:
             and contradiction <= max(config.most_contradiction, config.contradiction_per_support * support)
             and (plain or found.color <= config.most_color_error)
             and self._sharpness(symmetry) >= config.least_sharpness
+            and all(self._makes_others(symmetry, other) for other in known)
+        )
+
+    def _makes_others(self, a: Symmetry, b: Symmetry) -> bool:
+        """Whether what two mirror planes make of each other are planes of the same object.
+
+        Symmetries of a body form a group. Two planes at the right angle in the wrong place do not.
+        """
+        if "axis" in (a.kind, b.kind):
+            return True
+        # Errors of both planes add up.
+        least = 1.0 - 2.0 * (1.0 - self.config.least_share_later)
+        return all(
+            found.support >= least * (found.support + found.contradiction)
+            for found in self.agreement([a.mirrored(b), b.mirrored(a)])
         )
 
     def _refined(self, symmetries: Sequence[Symmetry]) -> list[Symmetry]:

@@ -14,7 +14,8 @@ def weighted_sum(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     Raises:
         KeyError: a term has no weight. (A weight whose term was never computed is the stage's error.)
     """
-    return torch.stack([weights[name] * term for name, term in terms.items()]).sum()
+    values = torch.stack(list(terms.values()))
+    return (values * values.new_tensor([weights[name] for name in terms])).sum()
 
 
 def mean_of(values: Iterable[Tensor]) -> Tensor:

@@ -166,6 +166,23 @@ def test_later_planes_need_more_evidence(plain_box: Box) -> None:
     assert len(find_symmetries(plain_box.surface, plain_box.empty, stricter)) == 1
 
 
+def test_planes_that_make_others_of_each_other_count_only_with_them() -> None:
+    """A plane through an edge of a box mirrors its corner, but not what another plane makes of it."""
+    box = trimesh.creation.box((0.12, 0.1, 0.04))
+    points, normals = sample_surface(box.vertices, box.faces, 3000)
+    surface = SeenSurface(points, normals, np.full_like(points, 0.5))
+    judge = symmetry_search._Judge(surface, outside(box), SymmetryConfig())
+    middle, edge = np.zeros(3), np.array([0.06, 0.05, 0.0])
+    known = Symmetry("plane", middle, np.array([1.0, 0.0, 0.0]))
+    assert judge._makes_others(Symmetry("plane", middle, np.array([0.0, 1.0, 0.0])), known)
+    assert not judge._makes_others(Symmetry("plane", edge, np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)), known)
+    twice = known.mirrored(Symmetry("plane", edge, np.array([0.6, 0.8, 0.0])))
+    again = twice.mirrored(Symmetry("plane", edge, np.array([0.6, 0.8, 0.0])))
+    np.testing.assert_allclose(again.point, known.point, atol=1e-12)
+    np.testing.assert_allclose(again.direction, known.direction, atol=1e-12)
+    assert not np.allclose(twice.direction, known.direction)
+
+
 def test_too_little_was_seen() -> None:
     few = SeenSurface(np.random.default_rng(0).normal(size=(50, 3)), np.eye(3)[[0] * 50], np.zeros((50, 3)))
     nowhere = EmptySpace(np.zeros((2, 2, 2)), np.full(3, -10.0), 20.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -182,7 +182,7 @@ def run_stage(
             StageProgress(
                 state.step,
                 stage.steps,
-                {name: float(value.detach()) for name, value in values.items()},
+                dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True)),
                 float(loss.detach()),
                 time.perf_counter() - began,
             ),
@@ -232,8 +232,15 @@ def _evaluate(step: Step, terms: Mapping[str, Term]) -> tuple[dict[str, Tensor],
             # The renderer refuses non-finite input; the user's poses were finite, so the optimisation is at
             # fault.
             return values, f"{name} is not finite: {error}{_first_unbounded(step.scene)}"
+    if _all_finite(values.values()):
+        return values, None
     bad = [name for name, value in values.items() if not torch.isfinite(value)]
-    return values, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}" if bad else None
+    return values, f"{', '.join(bad)} is not finite{_first_unbounded(step.scene)}"
+
+
+def _all_finite(scalars: Iterable[Tensor]) -> bool:
+    # One by one would be as many small operations as a term has.
+    return bool(torch.stack(list(scalars)).isfinite().all())
 
 
 def _first_unbounded(scene: Scene) -> str:
@@ -246,13 +253,15 @@ def _first_unbounded(scene: Scene) -> str:
 
 
 def _unbounded_gradient(scene: Scene) -> str | None:
-    for name, values in scene.named_parameters():
-        # A sum is finite only if every value is, except for overflow, which is as bad.
-        if values.grad is not None and not torch.isfinite(values.grad.sum()):
-            wrong = torch.nonzero(~torch.isfinite(values.grad))
-            place = f" at {wrong[0].tolist()}" if len(wrong) else ""
-            return f"the gradient of {name} is not finite{place}"
-    return None
+    gradients = {name: p.grad for name, p in scene.named_parameters() if p.grad is not None}
+    # A sum is finite only if every value is, except for overflow, which is as bad.
+    sums = {name: gradient.sum() for name, gradient in gradients.items()}
+    if not sums or _all_finite(sums.values()):
+        return None
+    name = next(name for name, total in sums.items() if not torch.isfinite(total))
+    wrong = torch.nonzero(~torch.isfinite(gradients[name]))
+    place = f" at {wrong[0].tolist()}" if len(wrong) else ""
+    return f"the gradient of {name} is not finite{place}"
 
 
 class _Kept:
