@@ -32,7 +32,7 @@ class FocalConfig:
     pixel_sigma: float = 0.07
     iterations: int = 40
     # More observations than this add time and no certainty, and fewer do not tell a focal length.
-    most_observations: int = 20_000
+    most_observations: int = 40_000
     least_observations: int = 1000
     # Errors of tracks are correlated: true errors are so many times those of independent ones, and never
     # less than `least_sigma`.
@@ -172,9 +172,9 @@ def _step(system: System, seen: Observations, border: _Border, damping: float) -
         held = np.einsum("nij,nj->ni", inverse, own)
         stiffness -= float((held * own).sum())
         gradient -= float((held * part.gradient).sum())
-        slots = 6 * batch.slots[batch.slot]
+        slots = 6 * batch.slots[batch.pair_slot]
         for i in range(6):
-            values = (part.coupling[i] * held[batch.point].T).sum(0)
+            values = (part.coupling[i] * held[batch.pair_point].T).sum(0)
             column -= np.bincount(slots + i, values, len(column))
     poses, follows = scipy.linalg.solve(
         reduced.matrix, np.stack([-reduced.gradient, -column], axis=1), assume_a="sym"

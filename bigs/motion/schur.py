@@ -41,7 +41,10 @@ class _Batch(NamedTuple):
     moving: np.ndarray  # [m] observations within the batch in frames that may move
     slots: np.ndarray  # [F] the frames that may move, by their index in the poses' equations
     slot: np.ndarray  # [m] index of each such observation's frame among these
-    point: np.ndarray  # [m] index of its point within the batch
+    # A frame may have seen a point twice; such observations are one pair of point and frame.
+    pairs: np.ndarray  # [p] where each pair's observations begin among those that may move
+    pair_slot: np.ndarray  # [p] index of each pair's frame among the slots
+    pair_point: np.ndarray  # [p] index of its point within the batch
 
 
 class PointPart(NamedTuple):
@@ -49,7 +52,7 @@ class PointPart(NamedTuple):
 
     matrix: np.ndarray  # [n, 3, 3]
     gradient: np.ndarray  # [n, 3]
-    coupling: np.ndarray  # [6, 3, m] of the observations in frames that may move
+    coupling: np.ndarray  # [6, 3, p] of the pairs of a point and a frame that may move
 
 
 class System(NamedTuple):
@@ -99,7 +102,11 @@ def sort_observations(
         here = np.flatnonzero(free[frame[rows]])
         used, slot = np.unique(slots[frame[rows][here]], return_inverse=True)
         starts = np.concatenate([[row], ends[began : until - 1]]) - row
-        batches.append(_Batch(rows, slice(began, until), starts, here, used, slot, rank[rows][here] - began))
+        owner = rank[rows][here] - began
+        pairs = np.flatnonzero(np.diff(owner, prepend=-1) | np.diff(slot, prepend=-1))
+        batches.append(
+            _Batch(rows, slice(began, until), starts, here, used, slot, pairs, slot[pairs], owner[pairs])
+        )
         began, row = until, rows.stop
     return Observations(order, frame, rank, np.ascontiguousarray(pixels[order].T), points[by_time], batches)
 
@@ -148,6 +155,8 @@ def linearise(
             coupling[3 + i] = [a[at] for a in turned[i]]
         for j in range(3):
             coupling[:3, j] = _cross(arm, coupling[3:, j])
+        if len(batch.pairs) < len(at):
+            coupling = np.add.reduceat(coupling, batch.pairs, axis=2)
         parts.append(PointPart(matrix, by_point, coupling))
         slot = batch.slots[batch.slot]
         _add_poses(
@@ -226,7 +235,7 @@ def reduce(system: System, seen: Observations, damping: float) -> Reduced:
             continue
         dense = np.zeros((len(points), 3, width))
         blocks = dense.reshape(len(points), 3, len(batch.slots), 6)
-        blocks[batch.point, :, batch.slot, :] = part.coupling.transpose(2, 1, 0)
+        blocks[batch.pair_point, :, batch.pair_slot, :] = part.coupling.transpose(2, 1, 0)
         # inverse = root rootᵀ, so that a single product of a matrix with itself remains.
         root = np.linalg.cholesky(0.5 * (inverse + inverse.transpose(0, 2, 1)))
         scaled = (root.transpose(0, 2, 1) @ dense).reshape(-1, width)
@@ -257,9 +266,9 @@ def point_steps(system: System, reduced: Reduced, seen: Observations, change: np
     steps = np.zeros((len(seen.points), 3))
     for batch, part, inverse in zip(seen.batches, system.parts, reduced.inverses, strict=True):
         pull = part.gradient.copy()
-        step = change.T[:, batch.slots[batch.slot]]
+        step = change.T[:, batch.slots[batch.pair_slot]]
         for j in range(3):
-            pull[:, j] += np.bincount(batch.point, _dot(part.coupling[:, j], step), len(pull))
+            pull[:, j] += np.bincount(batch.pair_point, _dot(part.coupling[:, j], step), len(pull))
         steps[batch.points] = -np.einsum("nij,nj->ni", inverse, pull)
     return steps
 
