@@ -61,6 +61,6 @@ class FakeRuns:
             (out / CHECKPOINTS).mkdir()
             raise FloatingPointError("stage joint, step 1: image is not finite")
         (out / LOG).write_text(
-            '{"event": "skipped", "text": "joint: 1 of 2 steps, the loss had converged"}\n'
+            '{"event": "skipped", "text": "joint: 1 of 2 steps, the loss had settled (0.4 s saved)"}\n'
         )
         write_json(out / METRICS, {"initial": SCORES, "result": SCORES | {"cd_r_sq": len(out.name) / 8}})

@@ -24,7 +24,7 @@ class FocalConfig:
 
     # Chance that the given one was calibrated, the usual error then, and that of a guess. With a chance of 1
     # nothing is measured.
-    calibrated: float = 0.75
+    calibrated: float = 0.8
     calibrated_sigma: float = 0.005
     guessed_sigma: float = 0.08
     # Standard deviation of a reprojection error, pixels: below the real one, since what is off by more leans

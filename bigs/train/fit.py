@@ -207,8 +207,10 @@ def fit(
         else:
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen_and_show)
             if last.step < stage.steps:
+                left = stage.steps - last.step
+                saved = watch.read()[stage.name] / last.step * left
                 report.skipped.append(
-                    f"{stage.name}: {stage.steps - last.step} of {stage.steps} steps, the loss had converged"
+                    f"{stage.name}: {left} of {stage.steps} steps, the loss had settled ({saved:.1f} s saved)"
                 )
             if last.pull is not None:
                 now = len(scene.object_splats.base_points)

@@ -84,7 +84,7 @@ def report() -> dict[str, Any]:
                 off=("contact",),
                 steps={"joint": 10},
                 planned={"joint": 10},
-                skipped=["joint: 2 of 10 steps, the loss had converged"],
+                skipped=["joint: 2 of 10 steps, the loss had settled (0.4 s saved)"],
             ),
             run("b", "fast without contact", 0.0, {}, off=("contact",), failure="OSError: disk full"),
         ],
@@ -139,7 +139,12 @@ def test_scores_along_a_run(report: dict[str, Any]) -> None:
 def test_what_was_saved(report: dict[str, Any]) -> None:
     rows = by_title(report)["Work left out"]
     assert ("fast", "a", "fields in 10 steps of hands, at the 50.0 ms of joint", "0.5") in rows
-    assert rows[-1] == ("fast without contact", "a", "joint: 2 of 10 steps, the loss had converged", "0.4")
+    assert rows[-1] == (
+        "fast without contact",
+        "a",
+        "joint: 2 of 10 steps, the loss had settled (0.4 s saved)",
+        "0.4",
+    )
 
 
 def test_a_run_that_was_interrupted_has_no_time(report: dict[str, Any]) -> None:

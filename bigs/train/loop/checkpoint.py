@@ -21,7 +21,7 @@ from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.density import Pull
 from bigs.train.loop.run_stage import NUMBERS, StageState
 
-FORMAT = "bigs-checkpoint-3"
+FORMAT = "bigs-checkpoint-4"
 FILE_NAME = "latest.safetensors"
 
 

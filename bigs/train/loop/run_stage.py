@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -39,9 +39,7 @@ class StageState(NamedTuple):
 
     step: int
     optimizer: FrameAdam
-    best: float  # smoothed loss that the stopping rule compares with
-    best_step: int
-    smoothed: float
+    recent: Sequence[float]  # the last losses, as many as the stopping rule compares
     retreats: int  # number of retreats after non-finite values
     found: Mapping[str, Tensor]  # the stage's start by name, if it needs it
     pull: Pull | None  # gradients at the object's Gaussians since the last densification
@@ -49,11 +47,11 @@ class StageState(NamedTuple):
     @classmethod
     def begun(cls, step: int, optimizer: FrameAdam, found: Mapping[str, Tensor] | None = None) -> StageState:
         """After `step` steps, of whose losses nothing is known yet."""
-        return cls(step, optimizer, float("inf"), 0, float("nan"), 0, found or {}, None)
+        return cls(step, optimizer, (), 0, found or {}, None)
 
 
-# The parts of `StageState` that are plain numbers.
-NUMBERS = ("step", "best", "best_step", "smoothed", "retreats")
+# The parts of `StageState` that are plain numbers, or some.
+NUMBERS = ("step", "recent", "retreats")
 # A stage gives up after this many retreats; each halves its rates.
 MOST_RETREATS = 4
 
@@ -287,15 +285,14 @@ class _Kept:
 
 
 def _advance(stage: OptimizeStage, state: StageState, loss: float) -> StageState:
-    smoothed = loss if state.step == 0 else 0.9 * state.smoothed + 0.1 * loss
-    improved = smoothed < state.best * (1.0 - stage.stop_gain)
-    return state._replace(
-        step=state.step + 1,
-        smoothed=smoothed,
-        best=smoothed if improved else state.best,
-        best_step=state.step if improved else state.best_step,
-    )
+    window = 2 * stage.stop_patience
+    return state._replace(step=state.step + 1, recent=[*state.recent, loss][-window:] if window else ())
 
 
 def _has_settled(stage: OptimizeStage, state: StageState) -> bool:
-    return stage.stop_patience > 0 and state.step - state.best_step > stage.stop_patience
+    half = stage.stop_patience
+    if half == 0 or len(state.recent) < 2 * half:
+        return False
+    # Not the lowest so far, since Adam's first steps often lead away from a good start.
+    before, now = sum(state.recent[:half]), sum(state.recent[half:])
+    return abs(now - before) < stage.stop_gain * abs(now)

@@ -40,9 +40,10 @@ class OptimizeStage:
     decay: Literal["cosine", "exponential"] = "cosine"
     # Adam's. The second suits stages of hundreds of steps, where 0.999 would still remember the first.
     adam_betas: tuple[float, float] = (0.9, 0.99)
-    # Stop if the smoothed loss has not fallen by `stop_gain` (relative) in `stop_patience` steps; 0: never.
+    # Stop if the mean loss of `stop_patience` steps differs by less than `stop_gain` (relative) from that of
+    # as many before; 0: never. For stages that look at the whole clip in every step: others waver.
     stop_patience: int = 0
-    stop_gain: float = 0.002
+    stop_gain: float = 0.005
     # Clone, split and prune the object's Gaussians during the stage; None keeps their number.
     densify: DensifyConfig | None = None
 

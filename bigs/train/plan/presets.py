@@ -35,6 +35,8 @@ _POSE_PRIORS = {
 # joint does not have (4 degrees, since a model's axes are not exactly a hand's) usually are.
 _GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5, "joint_axes": 60.0}
 
+# Of stages that look at the whole clip in every step.
+_SETTLED = 10
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
     step="single-subject",
@@ -50,6 +52,7 @@ _HANDS_COARSE = OptimizeStage(
     weights={"silhouette": 1.0, **_POSE_PRIORS},
     image_size=60,
     final_lr=0.5,
+    stop_patience=_SETTLED,
 )
 _HANDS_FINE = OptimizeStage(
     name="hands-fine",
@@ -65,6 +68,7 @@ _HANDS_FINE = OptimizeStage(
     },
     weights={"silhouette": 1.0, **_POSE_PRIORS, "rigid": 0.03},
     image_size=160,
+    stop_patience=_SETTLED,
 )
 # Grasps are known: what all frames of one agree on moves together.
 _GRASPED_RATES = {
@@ -86,6 +90,7 @@ _GRASPED = OptimizeStage(
     weights={"silhouette": 1.0, **_GRASP_PRIORS},
     image_size=160,
     final_lr=0.3,
+    stop_patience=_SETTLED,
 )
 _CONTACT = OptimizeStage(
     name="contact",
@@ -94,6 +99,7 @@ _CONTACT = OptimizeStage(
     lrs=_GRASPED_RATES,
     weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "penetration": 0.01},
     image_size=160,
+    stop_patience=_SETTLED,
 )
 # The hand's shape and skinning are the template's: colours of so few steps say nothing better about them.
 _APPEARANCE = OptimizeStage(
@@ -125,6 +131,7 @@ _REGRASP = OptimizeStage(
     weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
     image_size=160,
     free_frames=True,
+    stop_patience=_SETTLED,
 )
 
 # What keeps poses, shape and appearance plausible while everything moves together.

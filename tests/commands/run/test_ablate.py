@@ -83,7 +83,7 @@ def test_each_row_is_run_without_its_ingredients(runs: FakeRuns, tiny_clip: Path
     assert numbers["full"]["paper"]["cd_l_sq"] == 46.11
     assert numbers["full"]["scores"]["result"]["cd_r_sq"] == 0.5
     assert numbers["full"]["times"]["stages"]["joint"]["steps"] == 1
-    assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had converged"]
+    assert numbers["full"]["skipped"] == ["joint: 1 of 2 steps, the loss had settled (0.4 s saved)"]
 
 
 def test_a_row_that_fails_and_a_rerun(runs: FakeRuns, tiny_clip: Path, tmp_path: Path) -> None:
