@@ -59,7 +59,7 @@ def believed_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
         config: see there.
     """
     calibrated, guessed = config.calibrated_sigma, config.guessed_sigma
-    if config.calibrated >= 1.0 or len(bundle.frame) < config.least_observations:
+    if config.calibrated >= 1.0 or len(bundle.frame) < max(config.least_observations, 1):
         return FocalLength(1.0, calibrated)
     measured = measured_focal(bundle, K, scales, config)
     if not np.isfinite(measured.sigma):

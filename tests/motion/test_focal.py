@@ -116,4 +116,7 @@ def test_a_calibrated_camera_and_too_few_tracks_keep_what_was_given(monkeypatch:
     assert believed(wrong, FocalConfig(calibrated=1.0), monkeypatch).factor == 1.0
     assert believed(wrong, FocalConfig(least_observations=3000), monkeypatch).factor == 1.0
     assert believed(FocalLength(0.8, np.inf), FocalConfig(), monkeypatch).factor == 1.0
+    none = np.zeros(0, dtype=int)
+    nothing = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((0, 3)), none, none, np.zeros((0, 2)))
+    assert believed_focal(nothing, K, SCALES, FocalConfig(least_observations=0)).factor == 1.0
     assert believed(wrong, FocalConfig(calibrated=0.0), monkeypatch).factor == pytest.approx(0.8, rel=0.01)
