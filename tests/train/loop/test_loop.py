@@ -23,9 +23,6 @@ from bigs.train.grasps.find import find_grasps
 from bigs.train.loop.optim import GROUPS, group_parameters
 from bigs.train.loop.run_stage import (
     StageProgress,
-    StageState,
-    _advance,
-    _has_settled,
     choose_frames,
     run_stage,
     stage_entities,
@@ -248,55 +245,6 @@ def test_frozen_fields_are_evaluated_once(
     calls = count_calls(scene)
     run_stage(scene, replace(TOGETHER, steps=5, lrs=lrs, weights=weights), evidence, 0)
     assert calls == expected
-
-
-# --- stopping ---
-
-
-def steps_run(scene: Scene, evidence: Evidence, stage: OptimizeStage) -> StageState:
-    return run_stage(scene, stage, evidence, 0)
-
-
-def test_all_steps_without_a_stopping_rule(scene: Scene, evidence: Evidence) -> None:
-    state = steps_run(scene, evidence, replace(ALONE, steps=12, lrs={"hand.ray": 1e-9}))
-    assert state.step == 12
-
-
-def test_stops_when_the_loss_has_settled(scene: Scene, evidence: Evidence) -> None:
-    still = replace(TOGETHER, steps=40, lrs={"hand.ray": 1e-9}, weights={"silhouette": 1.0}, stop_patience=5)
-    still = replace(still, frames_per_step=0)
-    state = steps_run(scene, evidence, still)
-    # Two times five steps say the same, and the next is not taken.
-    assert state.step == 10
-    assert steps_run(scene, evidence, replace(still, stop_patience=0)).step == 40
-
-
-def test_goes_on_while_the_loss_falls(scene: Scene, evidence: Evidence) -> None:
-    with torch.no_grad():
-        for poses in scene.hand_poses.values():
-            poses.pose.fill_(0.5)
-    falling = replace(
-        TOGETHER,
-        steps=25,
-        lrs={"hand.pose": 1e-2},
-        weights={"pose_prior": 1.0},
-        frames_per_step=0,
-        stop_patience=2,
-    )
-    assert steps_run(scene, evidence, falling).step == 25
-
-
-def test_a_rise_from_a_good_start_is_no_end() -> None:
-    """Adam's first steps may lead away from a good start; the rule waits for what comes after."""
-    losses = [0.5, 0.9, 1.0, *(0.4 + 0.6 * 0.8**i for i in range(40))]
-    stage = replace(ALONE, steps=len(losses), stop_patience=4, stop_gain=0.01)
-    state = StageState.begun(0, None)
-    for loss in losses:
-        if _has_settled(stage, state):
-            break
-        state = _advance(stage, state, loss)
-    assert 20 < state.step < 35
-    assert losses[state.step] == pytest.approx(0.4, abs=0.005)
 
 
 # --- what a hook sees ---
