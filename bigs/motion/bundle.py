@@ -29,7 +29,7 @@ from bigs.motion.schur import (
 class BundleConfig:
     """Scales of the Cauchy losses, and when to stop."""
 
-    pixel_sigma: float = 0.25  # standard deviation of a reprojection error, pixels
+    pixel_sigma: float = 0.25  # standard deviation of a feature's reprojection error, pixels
     turn_sigma: float = 0.3  # the same of the change of angular velocity, degrees per frame and frame
     shift_sigma: float = 0.0015  # the same of the change of velocity, in depths per frame and frame
     # Given poses lose weight beyond this many standard deviations.
@@ -48,14 +48,26 @@ class Bundle(NamedTuple):
     frame: np.ndarray  # [M] frame of each observation
     point: np.ndarray  # [M] point of each observation
     pixels: np.ndarray  # [M, 2]
+    precision: np.ndarray  # [M, 3] inverse covariances (xx, xy, yy) of these, in units of 1 / pixel_sigma²
 
     def residuals(self, K: np.ndarray) -> np.ndarray:
         """Reprojection errors [M, 2] in pixels; huge where a point is behind the camera."""
         return _project(_in_camera(self), K) - self.pixels
 
+    def misfits(self, K: np.ndarray) -> np.ndarray:
+        """Squared reprojection errors [M] by the observations' precision, in pixels²."""
+        x, y = self.residuals(K).T
+        xx, xy, yy = self.precision.T
+        return xx * x**2 + 2.0 * xy * x * y + yy * y**2
+
     def depths(self) -> np.ndarray:
         """Depth [M] of every observed point in its frame."""
         return _in_camera(self)[:, 2]
+
+
+def alike(count: int) -> np.ndarray:
+    """The precision [count, 3] of observations whose errors are `pixel_sigma` in every direction."""
+    return np.tile([1.0, 0.0, 1.0], (count, 1))
 
 
 class Anchor(NamedTuple):
@@ -163,7 +175,7 @@ def make_problem(
     bundle: Bundle, K: np.ndarray, config: BundleConfig, free: np.ndarray, anchor: Anchor | None
 ) -> Problem:
     """What `adjust` minimises, with its arguments; `cost_of` and `linearise_all` evaluate it."""
-    seen = sort_observations(bundle.frame, bundle.point, bundle.pixels, free)
+    seen = sort_observations(bundle.frame, bundle.point, bundle.pixels, bundle.precision, free)
     return Problem(seen, free, K, config, anchor)
 
 
@@ -197,7 +209,7 @@ def _leaving(squared: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]
 def cost_of(problem: Problem, bundle: Bundle) -> float:
     """The sum of all losses, twice the negative logarithm of a likelihood."""
     config = problem.config
-    pixel, _ = _cauchy((bundle.residuals(problem.K) ** 2).sum(1) / config.pixel_sigma**2)
+    pixel, _ = _cauchy(bundle.misfits(problem.K) / config.pixel_sigma**2)
     turn, shift = _accelerations(bundle, config)
     total = pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
     if problem.anchor is not None:

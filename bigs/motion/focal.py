@@ -7,7 +7,7 @@ calibration is better than that, and one that somebody guessed is often worse. B
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from bigs.motion.bundle import Bundle, BundleConfig, Problem, cost_of, linearise_all, make_problem
-from bigs.motion.schur import Observations, Reduced, System, point_steps, reduce
+from bigs.motion.schur import Observations, Reduced, System, point_steps, pulled, reduce
 
 
 @dataclass(frozen=True)
@@ -27,17 +27,16 @@ class FocalConfig:
     calibrated: float = 0.8
     calibrated_sigma: float = 0.005
     guessed_sigma: float = 0.08
-    # Standard deviation of a reprojection error, pixels: below the real one, since what is off by more leans
-    # to one side.
-    pixel_sigma: float = 0.07
-    iterations: int = 40
+    iterations: int = 20
+    # Stop if a step lowers the cost by less than this share: a focal length changes it little.
+    tolerance: float = 1e-5
     # More observations than this add time and no certainty, and fewer do not tell a focal length.
     most_observations: int = 40_000
     least_observations: int = 1000
     # Errors of tracks are correlated: true errors are so many times those of independent ones, and never
     # less than `least_sigma`.
-    caution: float = 5.0
-    least_sigma: float = 0.02
+    caution: float = 10.0
+    least_sigma: float = 0.01
 
 
 class FocalLength(NamedTuple):
@@ -83,7 +82,6 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
 
     `sigma` is infinite where they say nothing.
     """
-    scales = replace(scales, pixel_sigma=config.pixel_sigma)
     bundle = _thinned(bundle, config.most_observations)
     free = np.ones(len(bundle.rotations), dtype=bool)
     problem = make_problem(bundle, K, scales, free, None)
@@ -111,7 +109,7 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
         sigma = config.caution / np.sqrt(step.stiffness)
         gain, cost, bundle, problem = cost - new_cost, new_cost, candidate, nearer
         growth, damping = growth + step.growth, max(damping / 6.0, 1e-6)
-        if gain < scales.tolerance * cost:
+        if gain < config.tolerance * cost:
             break
     return FocalLength(float(np.exp(growth)), float(np.hypot(sigma, config.least_sigma)))
 
@@ -149,8 +147,10 @@ def _border(problem: Problem, bundle: Bundle) -> _Border:
     focal = K[[0, 1], [0, 1]]
     grown = focal * ray  # derivative of the pixel
     off = grown + K[:2, 2] - seen.pixels.T
-    weight = 1.0 / (sigma**2 + (off**2).sum(1))
-    across = weight[:, None] * focal / depth * grown
+    (xx, xy, yy), off_pull = pulled(seen.precision, off.T, sigma)
+    # Of the pixel's derivatives by the focal length and by its place.
+    held = np.stack([xx * grown[:, 0] + xy * grown[:, 1], xy * grown[:, 0] + yy * grown[:, 1]], axis=1)
+    across = focal / depth * held
     pull = np.concatenate([across, -(ray * across).sum(1, keepdims=True)], axis=1)  # by the place
     starts = np.concatenate([batch.starts + batch.rows.start for batch in seen.batches])
     by_pose = np.concatenate([np.cross(arm, pull), pull], axis=1)
@@ -158,8 +158,8 @@ def _border(problem: Problem, bundle: Bundle) -> _Border:
     return _Border(
         np.stack([np.bincount(seen.frame, by_pose[:, i], frames) for i in range(6)], axis=1).ravel(),
         np.add.reduceat(np.einsum("mji,mj->mi", rotation, pull), starts, axis=0),
-        float(weight @ (grown**2).sum(1)),
-        float(weight @ (grown * off).sum(1)),
+        float((grown * held).sum()),
+        float((grown * np.transpose(off_pull)).sum()),
     )
 
 
@@ -204,7 +204,11 @@ def _thinned(bundle: Bundle, most: int) -> Bundle:
     rows = kept[bundle.point]
     used, point = np.unique(bundle.point[rows], return_inverse=True)
     return bundle._replace(
-        points=bundle.points[used], frame=bundle.frame[rows], point=point, pixels=bundle.pixels[rows]
+        points=bundle.points[used],
+        frame=bundle.frame[rows],
+        point=point,
+        pixels=bundle.pixels[rows],
+        precision=bundle.precision[rows],
     )
 
 

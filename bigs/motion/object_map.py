@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.spatial
 
-from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust
+from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust, alike
 from bigs.motion.features import FrameFeatures
 from bigs.motion.tracks import Tracks
 
@@ -50,6 +50,8 @@ class ObjectMap:
         self.pixels = np.array(
             [features[t].pixels[i] for t, i in zip(self.frame, self.feature, strict=True)]
         ).reshape(-1, 2)
+        # [M, 3] inverse covariances (xx, xy, yy), in units of 1 / bundle.pixel_sigma²
+        self.precision = alike(len(self.frame))
         self.good = np.ones(len(self.frame), dtype=bool)  # [M] believed
         self.points = np.zeros((tracks.total, 3))
         self.known = np.zeros(tracks.total, dtype=bool)  # which points have been triangulated
@@ -180,9 +182,16 @@ class ObjectMap:
         seen = np.bincount(self.track[self.use()], minlength=len(self.points))
         self.known &= seen >= 2
 
-    def replace_observations(self, frame: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> None:
-        """Take other observations: [M], [M] and [M, 2]. They are no features, so `search` knows none."""
+    def replace_observations(
+        self, frame: np.ndarray, track: np.ndarray, pixels: np.ndarray, covariances: np.ndarray
+    ) -> None:
+        """Take other observations: [M], [M], [M, 2] and the covariances [M, 2, 2] of their pixels.
+
+        They are no features, so `search` knows none.
+        """
         self.frame, self.track, self.pixels = frame, track, pixels
+        inverses = self.config.bundle.pixel_sigma**2 * np.linalg.inv(covariances)
+        self.precision = inverses[:, [0, 0, 1], [0, 1, 1]]
         self.feature = np.full(len(frame), -1)
         self.good = np.ones(len(frame), dtype=bool)
 
@@ -199,6 +208,7 @@ class ObjectMap:
             self.frame[rows] - frames[0],
             point,
             self.pixels[rows],
+            self.precision[rows],
         )
         return bundle, tracks
 
@@ -252,6 +262,7 @@ class ObjectMap:
             self.feature = np.concatenate([self.feature, new])
             self.track = np.concatenate([self.track, found])
             self.pixels = np.concatenate([self.pixels, features.pixels[new]])
+            self.precision = np.concatenate([self.precision, alike(len(new))])
             self.good = np.concatenate([self.good, np.ones(len(new), dtype=bool)])
         return len(new)
 

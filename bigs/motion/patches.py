@@ -42,20 +42,26 @@ class PatchConfig:
     likeness: float = 0.8
     most_moved: float = 4.0
     # Standard deviation of its position along the direction in which it says least.
-    most_unsure: float = 0.2
-    # Matches whose patch was not recognised count only in frames with fewer recognised ones than this.
+    most_unsure: float = 0.5
+    # Its errors are this many times what unlikeness lets expect, and never less than `least_error`.
+    optimism: float = 2.0
+    least_error: float = 0.02
+    # A frame with fewer recognised patches than this goes by its matches, too. ...
     enough: int = 30
+    # ... In others a match whose patch was not recognised is off by so much.
+    unrecognised_error: float = 0.7
     iterations: int = 10
     # Rounds of measuring and adjusting.
     passes: int = 3
 
 
 class Observations(NamedTuple):
-    """Which point was seen where."""
+    """Which point was seen where, and how surely."""
 
     frame: np.ndarray  # [M]
     track: np.ndarray  # [M]
     pixels: np.ndarray  # [M, 2]
+    covariances: np.ndarray  # [M, 2, 2] of these
 
 
 def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
@@ -67,7 +73,8 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         config: see there.
     """
     use = map_.use()
-    found = matched = Observations(map_.frame[use], map_.track[use], map_.pixels[use])
+    usual = np.tile(map_.config.bundle.pixel_sigma**2 * np.eye(2), (int(use.sum()), 1, 1))
+    found = matched = Observations(map_.frame[use], map_.track[use], map_.pixels[use], usual)
     frames = np.arange(len(map_.posed))
     everything = np.ones(len(frames), dtype=bool)
     for _ in range(config.passes):
@@ -82,7 +89,8 @@ def sharpen(map_: ObjectMap, pictures: Pictures, config: PatchConfig) -> None:
         map_.adjust(frames, everything, map_.config.bundle)
         map_.judge()
     # Where they agree with these poses they are kept, since they connect frames.
-    map_.replace_observations(*_united(found, matched, everything))
+    vague = np.where(poor[matched.frame, None, None], usual, config.unrecognised_error**2 * np.eye(2))
+    map_.replace_observations(*_united(found, matched._replace(covariances=vague), everything))
     map_.judge()
     map_.triangulate()
 
@@ -161,6 +169,7 @@ def _measured(
     whole = (templates.weight > 0).mean(1) > config.least_shown
     whole &= facing[frontal] > config.least_cosine
 
+    exact = config.least_error**2 * np.eye(2)
     found = []
     for t in range(len(eyes)):
         view = eyes[t] - points
@@ -169,10 +178,12 @@ def _measured(
         start, warp = _warps(map_, t, own[rows], points[rows], normals[rows])
         laid = lay(pictures, t, start, warp, Templates(*(part[rows] for part in templates)), config)
         rows = rows[laid.fits]
-        found.append(Observations(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits]))
+        covariances = config.optimism**2 * laid.covariances[laid.fits] + exact
+        found.append(Observations(np.full(len(rows), t), tracks[rows], laid.pixels[laid.fits], covariances))
     # A patch's own observation counts as recognised if it was recognised elsewhere.
     again = np.isin(tracks, np.concatenate([observations.track for observations in found]))
-    found.append(Observations(own[again], tracks[again], middle[again]))
+    exactly = np.tile(exact, (int(again.sum()), 1, 1))
+    found.append(Observations(own[again], tracks[again], middle[again], exactly))
     return Observations(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
@@ -215,6 +226,7 @@ class Laid(NamedTuple):
     """Patches as another frame shows them."""
 
     pixels: np.ndarray  # [N, 2]
+    covariances: np.ndarray  # [N, 2, 2] of these, where what is unlike is taken for noise
     fits: np.ndarray  # [N] (bool) which were recognised and located
 
 
@@ -230,7 +242,7 @@ def lay(
 
     The engine moves each to where it fits best, and says whether it was recognised there.
     """
-    places, fits = _raster.lay_patches(
+    places, covariances, fits = _raster.lay_patches(
         pictures[t],
         templates,
         pictures.places(t, start),
@@ -239,4 +251,5 @@ def lay(
         config.iterations,
         (config.least_shown, config.likeness, config.most_moved, config.most_unsure / pictures.shrunk),
     )
-    return Laid(pictures.pixels(t, places.reshape(-1, 2)), fits)
+    covariances = pictures.shrunk**2 * covariances.reshape(-1, 3)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    return Laid(pictures.pixels(t, places.reshape(-1, 2)), covariances, fits)

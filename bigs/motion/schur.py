@@ -28,6 +28,7 @@ class Observations(NamedTuple):
     frame: np.ndarray  # [M]
     point: np.ndarray  # [M] rank of the point
     pixels: np.ndarray  # [2, M]
+    precision: np.ndarray  # [3, M]: inverse covariances (xx, xy, yy) in units of 1 / sigma²
     points: np.ndarray  # [P] the caller's number of each observed point
     batches: list[_Batch]
 
@@ -72,12 +73,12 @@ class Reduced(NamedTuple):
 
 
 def sort_observations(
-    frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, free: np.ndarray
+    frame: np.ndarray, point: np.ndarray, pixels: np.ndarray, precision: np.ndarray, free: np.ndarray
 ) -> Observations:
     """Observations [M] in batches of points that are first seen in about the same frame.
 
     Args:
-        frame, point, pixels: [M], [M] and [M, 2].
+        frame, point, pixels, precision: [M], [M], [M, 2] and [M, 3].
         free: [T] bool, frames that may move.
     """
     points, rank = np.unique(point, return_inverse=True)
@@ -108,7 +109,8 @@ def sort_observations(
             _Batch(rows, slice(began, until), starts, here, used, slot, pairs, slot[pairs], owner[pairs])
         )
         began, row = until, rows.stop
-    return Observations(order, frame, rank, np.ascontiguousarray(pixels[order].T), points[by_time], batches)
+    ordered = (np.ascontiguousarray(values[order].T) for values in (pixels, precision))
+    return Observations(order, frame, rank, *ordered, points[by_time], batches)
 
 
 def linearise(
@@ -139,7 +141,7 @@ def linearise(
         rotation = rotations.transpose(1, 2, 0)[:, :, seen.frame[batch.rows]]
         spoke = _times(rotation, points.T[:, seen.point[batch.rows]])
         place = [a + b for a, b in zip(spoke, transl.T[:, seen.frame[batch.rows]], strict=True)]
-        hessian, pull = _by_place(place, seen.pixels[:, batch.rows], K, sigma)
+        hessian, pull = _by_place(place, seen.pixels[:, batch.rows], seen.precision[:, batch.rows], K, sigma)
         turned = [_times(np.transpose(rotation, (1, 0, 2)), row) for row in hessian]  # rows of hessian @ R
         matrix = np.empty((len(batch.starts), 3, 3))
         by_point = np.empty((len(batch.starts), 3))
@@ -171,23 +173,33 @@ def linearise(
 
 
 def _by_place(
-    place: _Numbers, pixels: np.ndarray, K: np.ndarray, sigma: float
+    place: _Numbers, pixels: np.ndarray, precision: np.ndarray, K: np.ndarray, sigma: float
 ) -> tuple[list[list[np.ndarray]], list[np.ndarray]]:
     """Second and first derivatives [3][3] and [3] of the losses by places in the camera's frame."""
     z = np.where(place[2] > 1e-6, place[2], 1e-6)
     u, v = place[0] / z, place[1] / z
     wide, high = K[0, 0] / z, K[1, 1] / z
-    right, below = K[0, 0] * u + K[0, 2] - pixels[0], K[1, 1] * v + K[1, 2] - pixels[1]
-    weight = 1.0 / (sigma**2 + right**2 + below**2)
-    across, down = weight * wide**2, weight * high**2
-    none = np.zeros_like(u)
-    hessian = [
-        [across, none, -across * u],
-        [none, down, -down * v],
-        [-across * u, -down * v, across * u**2 + down * v**2],
-    ]
-    right, below = weight * wide * right, weight * high * below
+    off = K[0, 0] * u + K[0, 2] - pixels[0], K[1, 1] * v + K[1, 2] - pixels[1]
+    (xx, xy, yy), (right, below) = pulled(precision, off, sigma)
+    xx, xy, yy = wide**2 * xx, wide * high * xy, high**2 * yy
+    far_x, far_y = -(u * xx + v * xy), -(u * xy + v * yy)
+    right, below = wide * right, high * below
+    hessian = [[xx, xy, far_x], [xy, yy, far_y], [far_x, far_y, -(u * far_x + v * far_y)]]
     return hessian, [right, below, -u * right - v * below]
+
+
+def pulled(precision: np.ndarray, off: _Numbers, sigma: float) -> tuple[_Numbers, list[np.ndarray]]:
+    """Second derivatives (xx, xy, yy) and first ones [2] of Cauchy losses by pixels, halved.
+
+    Args:
+        precision: [3, M] of the observations, in units of 1 / `sigma`².
+        off: [2, M] reprojection errors in pixels.
+        sigma: pixels.
+    """
+    xx, xy, yy = precision
+    right, below = xx * off[0] + xy * off[1], xy * off[0] + yy * off[1]
+    weight = 1.0 / (sigma**2 + right * off[0] + below * off[1])
+    return weight * precision, [weight * right, weight * below]
 
 
 def _add_poses(

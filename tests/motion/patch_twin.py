@@ -79,7 +79,8 @@ def lay_twin(
         & (shown > config.least_shown)
         & (pictures.shrunk * sigma < config.most_unsure)
     )
-    return Laid(pictures.pixels(t, places.numpy()), fits.numpy()), likeness.numpy()
+    covariance = pictures.shrunk**2 * noise[:, None, None] * turn @ torch.linalg.pinv(normal) @ turn.mT
+    return Laid(pictures.pixels(t, places.numpy()), covariance.numpy(), fits.numpy()), likeness.numpy()
 
 
 def standardised(grey: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

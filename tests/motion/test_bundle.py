@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
-from bigs.motion.bundle import Bundle, BundleConfig, adjust, turn_uncertainties
+from bigs.motion.bundle import Bundle, BundleConfig, adjust, alike, turn_uncertainties
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,8 @@ def egg() -> TurningObject:
 def true_bundle(egg: TurningObject) -> Bundle:
     frame = np.concatenate([np.full(len(ids), t) for t, ids in enumerate(egg.ids)])
     pixels = np.concatenate([features.pixels for features in egg.features])
-    return Bundle(egg.rotations, egg.transl, egg.points, frame, np.concatenate(egg.ids), pixels)
+    point = np.concatenate(egg.ids)
+    return Bundle(egg.rotations, egg.transl, egg.points, frame, point, pixels, alike(len(pixels)))
 
 
 def disturbed(bundle: Bundle, rng: np.random.Generator, frames: slice = slice(None)) -> Bundle:
@@ -51,10 +52,30 @@ def test_wrong_observations_hardly_move_the_poses(egg: TurningObject) -> None:
     assert rotation_errors(found.rotations, egg.rotations).max() < 0.2
 
 
+def test_what_an_observation_says_vaguely_hardly_moves_the_poses(egg: TurningObject) -> None:
+    """As a patch on an edge says: across the edge it is right, along it by three pixels wrong."""
+    rng = np.random.default_rng(5)
+    bundle = true_bundle(egg)
+    angle = rng.uniform(0.0, np.pi, len(bundle.pixels))
+    edge = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    pixels = bundle.pixels + rng.normal(0.0, 3.0, (len(edge), 1)) * edge
+    across = np.stack([edge[:, 1] ** 2, -edge[:, 0] * edge[:, 1], edge[:, 0] ** 2], axis=1)
+    vague = bundle._replace(pixels=pixels, precision=across + 1e-4 * alike(len(edge)))
+    known = rotation_errors(adjust(vague, K, BundleConfig()).rotations, egg.rotations)
+    blind = vague._replace(precision=bundle.precision)
+    ignored = rotation_errors(adjust(blind, K, BundleConfig()).rotations, egg.rotations)
+    assert known.max() < 0.1 < 0.5 * ignored.max()
+
+
 def test_a_frame_without_observations_goes_where_the_motion_leads(egg: TurningObject) -> None:
     bundle = true_bundle(egg)
     keep = ~np.isin(bundle.frame, (7, 8))
-    blind = bundle._replace(frame=bundle.frame[keep], point=bundle.point[keep], pixels=bundle.pixels[keep])
+    blind = bundle._replace(
+        frame=bundle.frame[keep],
+        point=bundle.point[keep],
+        pixels=bundle.pixels[keep],
+        precision=bundle.precision[keep],
+    )
     found = adjust(disturbed(blind, np.random.default_rng(3), slice(7, 9)), K, BundleConfig(iterations=40))
     assert rotation_errors(found.rotations, egg.rotations).max() < 0.5
     assert np.linalg.norm(found.transl - egg.transl, axis=1)[7:9].max() < 0.002

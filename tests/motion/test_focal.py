@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from turning_object import K, turning_object
 
-from bigs.motion.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.bundle import Bundle, BundleConfig, adjust, alike
 from bigs.motion.focal import FocalConfig, FocalLength, believed_focal, measured_focal, scaled_focal
 
-SCALES = BundleConfig(iterations=60, tolerance=1e-9)
+SCALES = BundleConfig(pixel_sigma=0.15, iterations=60, tolerance=1e-9)
 # Errors of tracks as they are told apart, without what is added for those of real ones.
-BARE = FocalConfig(caution=1.0, least_sigma=0.0, pixel_sigma=0.15, least_observations=100)
+BARE = FocalConfig(caution=1.0, least_sigma=0.0, least_observations=100)
 
 
 def seen_through(factor: float, noise: float, frames: int = 30, seed: int = 0) -> Bundle:
@@ -25,7 +25,7 @@ def seen_through(factor: float, noise: float, frames: int = 30, seed: int = 0) -
     used, point = np.unique(point[often], return_inverse=True)
     pixels = np.concatenate([features.pixels for features in egg.features])[often]
     further = egg.transl * [1.0, 1.0, factor]
-    start = Bundle(egg.rotations, further, egg.points[used], frame[often], point, pixels)
+    start = Bundle(egg.rotations, further, egg.points[used], frame[often], point, pixels, alike(len(pixels)))
     return adjust(start, scaled_focal(K, factor), replace(SCALES, iterations=8))
 
 
@@ -53,7 +53,11 @@ def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(schur, "_BATCH", 200)
     whole = seen_through(1.0, 0.3, frames=6)
-    bundle = focal._thinned(whole, 150)
+    roots = np.random.default_rng(1).normal(0.0, 0.4, (len(whole.frame), 2, 2)) + np.eye(2)
+    bundle = focal._thinned(
+        whole._replace(precision=(roots @ roots.transpose(0, 2, 1))[:, [0, 0, 1], [0, 1, 1]]), 150
+    )
+    root = np.linalg.cholesky(bundle.precision[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     assert 80 < len(bundle.frame) <= 150
     scales = replace(SCALES, pixel_sigma=0.5, turn_sigma=1e4, shift_sigma=1e3)  # no prior to speak of
     problem = focal.make_problem(bundle, K, scales, np.ones(6, dtype=bool), None)
@@ -61,7 +65,10 @@ def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch
         focal.linearise_all(problem, bundle), problem.seen, focal._border(problem, bundle), 1e-2
     )
 
-    residual = bundle.residuals(K)
+    def whitened(there: Bundle, K: np.ndarray) -> np.ndarray:
+        return np.einsum("mji,mj->mi", root, there.residuals(K))
+
+    residual = whitened(bundle, K)
     weight = np.sqrt(1.0 / (0.5**2 + (residual**2).sum(1)))[:, None]
     poses, count = 6 * 6, 6 * 6 + bundle.points.size + 1
 
@@ -72,7 +79,7 @@ def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch
             transl=bundle.transl + change[:poses].reshape(6, 6)[:, 3:],
             points=bundle.points + change[poses:-1].reshape(-1, 3),
         )
-        return (there.residuals(scaled_focal(K, np.exp(change[-1]))) * weight).ravel()
+        return (whitened(there, scaled_focal(K, np.exp(change[-1]))) * weight).ravel()
 
     jacobian = np.stack([(moved(d) - moved(-d)) / 2e-6 for d in 1e-6 * np.eye(count)], axis=1)
     matrix, gradient = jacobian.T @ jacobian, jacobian.T @ (residual * weight).ravel()
@@ -89,7 +96,8 @@ def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch
 def believed(measured: FocalLength, config: FocalConfig, monkeypatch: pytest.MonkeyPatch) -> FocalLength:
     monkeypatch.setattr("bigs.motion.focal.measured_focal", lambda *_: measured)
     many = np.zeros(2000, dtype=int)
-    bundle = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((1, 3)), many, many, np.zeros((len(many), 2)))
+    observed = (many, many, np.zeros((2000, 2)), alike(2000))
+    bundle = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((1, 3)), *observed)
     return believed_focal(bundle, K, SCALES, config)
 
 
@@ -117,6 +125,7 @@ def test_a_calibrated_camera_and_too_few_tracks_keep_what_was_given(monkeypatch:
     assert believed(wrong, FocalConfig(least_observations=3000), monkeypatch).factor == 1.0
     assert believed(FocalLength(0.8, np.inf), FocalConfig(), monkeypatch).factor == 1.0
     none = np.zeros(0, dtype=int)
-    nothing = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((0, 3)), none, none, np.zeros((0, 2)))
+    observed = (none, none, np.zeros((0, 2)), alike(0))
+    nothing = Bundle(np.eye(3)[None], np.ones((1, 3)), np.zeros((0, 3)), *observed)
     assert believed_focal(nothing, K, SCALES, FocalConfig(least_observations=0)).factor == 1.0
     assert believed(wrong, FocalConfig(calibrated=0.0), monkeypatch).factor == pytest.approx(0.8, rel=0.01)

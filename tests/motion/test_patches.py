@@ -76,6 +76,30 @@ def test_pictures_of_something_else_leave_the_matches_in_force(filmed: Filmed) -
     assert rotation_errors(found.rotations, before).max() < 0.5
 
 
+def test_patches_count_by_what_they_say_and_what_was_not_recognised_little(filmed: Filmed) -> None:
+    """But a frame of noise, where nothing is recognised, goes by its matches."""
+    config = PatchConfig()
+    images = [*filmed.images]
+    images[5] = np.random.default_rng(1).integers(0, 255, images[5].shape, dtype=np.uint8)
+    found = copy.deepcopy(filmed.map)
+    sharpen(found, Pictures(images, filmed.masks, config), config)
+    use = found.use()
+    sigma, vague = found.config.bundle.pixel_sigma, config.unrecognised_error
+    matrices = found.precision[:, [0, 1, 1, 2]].reshape(-1, 2, 2) / sigma**2
+    errors = 1.0 / np.sqrt(np.linalg.eigvalsh(matrices))  # pixels, the largest first
+    np.testing.assert_allclose(errors[use & (found.frame == 5)], sigma, rtol=1e-6)
+    elsewhere = errors[use & (found.frame != 5)]
+    assert np.isclose(elsewhere[:, 1], vague).any()
+    assert elsewhere.min() > 0.99 * config.least_error
+    assert np.median(elsewhere[:, 0]) > 1.3 * np.median(elsewhere[:, 1])
+    # What is told to be surer is nearer to where the true object has it.
+    seen = use & (found.frame != 5) & ~np.isclose(errors[:, 1], vague)
+    off = np.linalg.norm(found.reproject(seen) - found.pixels[seen], axis=1)
+    told = errors[seen, 0]
+    sure = told < np.median(told)
+    assert np.median(off[sure]) < 0.8 * np.median(off[~sure])
+
+
 @pytest.mark.parametrize("grey", [0, 128])
 def test_even_pictures_leave_the_matches_in_force(filmed: Filmed, grey: int) -> None:
     even = [np.full_like(image, grey) for image in filmed.images]
@@ -129,3 +153,5 @@ def test_the_engine_does_what_its_twin_does(filmed: Filmed, coarser: int, half: 
     assert (laid.fits != twin.fits)[plain].sum() <= 2
     both = laid.fits & twin.fits
     assert np.abs(laid.pixels - twin.pixels)[both].max() < 5e-3 * coarser
+    size = np.einsum("nii->n", twin.covariances)[:, None, None]
+    assert (np.abs(laid.covariances - twin.covariances) / size)[both].max() < 0.03

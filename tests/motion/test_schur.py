@@ -25,7 +25,9 @@ def noisy_bundle(frames: int, points: int, share: float, twice: int = 0) -> Bund
     frame, point = np.nonzero(seen)
     again = rng.permutation(len(frame))[:twice]
     frame, point = np.append(frame, frame[again]), np.append(point, point[again])
-    bundle = Bundle(rotations, transl, places, frame, point, np.zeros((len(frame), 2)))
+    roots = rng.normal(0.0, 0.4, (len(frame), 2, 2)) + np.eye(2)
+    precision = (roots @ roots.transpose(0, 2, 1))[:, [0, 0, 1], [0, 1, 1]]
+    bundle = Bundle(rotations, transl, places, frame, point, np.zeros((len(frame), 2)), precision)
     return bundle._replace(pixels=bundle.residuals(K) + 0.5 * rng.standard_normal((len(frame), 2)))
 
 
@@ -39,16 +41,22 @@ def moved(bundle: Bundle, change: np.ndarray, free: np.ndarray) -> Bundle:
     return bundle._replace(rotations=rotations, transl=transl, points=points)
 
 
+def whitened(bundle: Bundle) -> np.ndarray:
+    """Reprojection errors [M, 2] whose squares count alike."""
+    precision = bundle.precision[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    return np.einsum("mji,mj->mi", np.linalg.cholesky(precision), bundle.residuals(K))
+
+
 def full_equations(bundle: Bundle, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton's matrix and gradient over poses and points, by central differences."""
-    residual = bundle.residuals(K)
+    residual = whitened(bundle)
     weight = 1.0 / (SIGMA**2 + (residual**2).sum(1))
     count = 6 * int(free.sum()) + bundle.points.size
     columns = []
     for i in range(count):
         step = np.zeros(count)
         step[i] = 1e-6
-        ahead, behind = moved(bundle, step, free).residuals(K), moved(bundle, -step, free).residuals(K)
+        ahead, behind = whitened(moved(bundle, step, free)), whitened(moved(bundle, -step, free))
         columns.append(((ahead - behind) / 2e-6 * np.sqrt(weight)[:, None]).ravel())
     jacobian = np.stack(columns, axis=1)
     return jacobian.T @ jacobian, jacobian.T @ (residual * np.sqrt(weight)[:, None]).ravel()
@@ -67,7 +75,7 @@ def test_points_are_eliminated_exactly(
     free = np.ones(6, dtype=bool)
     free[list(still)] = False
     frames = int(free.sum())
-    seen = schur.sort_observations(bundle.frame, bundle.point, bundle.pixels, free)
+    seen = schur.sort_observations(bundle.frame, bundle.point, bundle.pixels, bundle.precision, free)
     assert (len(seen.batches) > 1) == (batch == 16)
     points = bundle.points[seen.points]
     system = schur.linearise(seen, bundle.rotations, bundle.transl, points, K, SIGMA, frames)

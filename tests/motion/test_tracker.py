@@ -10,7 +10,7 @@ from filmed_egg import film
 from scipy.spatial.transform import Rotation
 from turning_object import K, TurningObject, rotation_errors, turning_object
 
-from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust, pose_covariances
+from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust, alike, pose_covariances
 from bigs.motion.features import NOTHING
 from bigs.motion.tracker import (
     GivenPoses,
@@ -130,6 +130,7 @@ def little() -> Bundle:
         frame,
         point,
         np.zeros((250, 2)),
+        alike(250),
     )
     return bundle._replace(pixels=bundle.residuals(K))
 
@@ -156,7 +157,8 @@ def test_covariances_are_those_of_many_adjustments(little: Bundle) -> None:
 
 
 def test_an_anchor_holds_what_no_observation_tells(little: Bundle) -> None:
-    nothing = little._replace(frame=little.frame[:0], point=little.point[:0], pixels=little.pixels[:0])
+    none = (little.frame[:0], little.point[:0], little.pixels[:0], little.precision[:0])
+    nothing = Bundle(little.rotations, little.transl, little.points, *none)
     anchor = Anchor(little.rotations, little.transl, np.ones(10), np.radians(1.0), np.full(3, 0.002))
     rng = np.random.default_rng(3)
     turned = Rotation.from_rotvec(0.03 * rng.standard_normal((10, 3))).as_matrix() @ little.rotations

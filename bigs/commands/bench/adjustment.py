@@ -17,7 +17,7 @@ from bigs.bench.machine import machine_facts
 from bigs.bench.page import Rows, Table, page
 from bigs.checks import InputError
 from bigs.commands.folder.contents import write_json
-from bigs.motion.bundle import Bundle, BundleConfig, adjust
+from bigs.motion.bundle import Bundle, BundleConfig, adjust, alike
 
 PAGE = "adjustment.md"
 NUMBERS = "adjustment.json"
@@ -96,7 +96,7 @@ def simulated(frames: int, points: int, seen: int, seed: int) -> tuple[Bundle, n
     first = rng.integers(0, frames - seen + 1, points)
     point = np.repeat(np.arange(points), seen)
     frame = (first[:, None] + np.arange(seen)).ravel()
-    exact = Bundle(rotations, transl, places, frame, point, np.zeros((len(frame), 2)))
+    exact = Bundle(rotations, transl, places, frame, point, np.zeros((len(frame), 2)), alike(len(frame)))
     pixels = exact.residuals(_K) + _NOISE * rng.standard_normal((len(frame), 2))
     off = Rotation.from_rotvec(np.radians(2.0) * rng.standard_normal((frames, 3))).as_matrix()
     start = exact._replace(

@@ -106,6 +106,7 @@ pub(crate) fn lay_patches<'py>(
         py,
         [
             gradient(py, laid.places.into_flattened()).into_any(),
+            gradient(py, laid.covariances.into_flattened()).into_any(),
             gradient(py, laid.fits).into_any(),
         ],
     )

@@ -44,6 +44,8 @@ pub struct Laying {
 pub struct Laid {
     /// Their middles.
     pub places: Vec<[f32; 2]>,
+    /// How sure these are: covariances (right right, right down, down down), where what is unlike is taken for noise.
+    pub covariances: Vec<[f32; 3]>,
     /// Which were recognised, and say where they are.
     pub fits: Vec<bool>,
 }
@@ -73,7 +75,7 @@ pub fn lay(
             return Err(TrackError::length(what, expected, found));
         }
     }
-    let found: Vec<([f32; 2], bool)> = (
+    let found: Vec<Landed> = (
         templates.grey.par_chunks_exact(size),
         templates.slope.par_chunks_exact(size),
         templates.weight.par_chunks_exact(size),
@@ -89,8 +91,11 @@ pub fn lay(
             },
         )
         .collect();
-    let (places, fits) = found.into_iter().unzip();
-    Ok(Laid { places, fits })
+    Ok(Laid {
+        places: found.iter().map(|landed| landed.place).collect(),
+        covariances: found.iter().map(|landed| landed.covariance).collect(),
+        fits: found.iter().map(|landed| landed.fits).collect(),
+    })
 }
 
 /// One patch on its way; the buffers serve one after the other.
@@ -115,6 +120,13 @@ struct Patch {
     sums: [f32; 5],
     shown: f32,
     normal: [f32; 3],
+}
+
+/// Where one patch came to lie.
+struct Landed {
+    place: [f32; 2],
+    covariance: [f32; 3],
+    fits: bool,
 }
 
 /// What a patch says at a place.
@@ -204,7 +216,7 @@ impl Patch {
     }
 
     /// Step to where the patch fits best; says whether it does.
-    fn settle(&mut self, picture: &Picture<'_>, start: [f32; 2], settings: &Laying) -> ([f32; 2], bool) {
+    fn settle(&mut self, picture: &Picture<'_>, start: [f32; 2], settings: &Laying) -> Landed {
         let [a, b, c] = self.normal;
         let ridge = RIDGE * (a + c) + TINY;
         let determinant = (a + ridge) * (c + ridge) - b * b;
@@ -234,7 +246,25 @@ impl Patch {
             && moved < settings.most_moved
             && self.shown > settings.least_shown
             && unsure < settings.most_unsure;
-        (place, fits)
+        Landed {
+            place,
+            covariance: self.covariance(noise),
+            fits,
+        }
+    }
+
+    /// How sure a place is, in the picture that the patch is laid on, for `noise` of the patch's own deviation.
+    fn covariance(&self, noise: f32) -> [f32; 3] {
+        let [a, b, c] = self.normal;
+        let scale = noise / (a * c - b * b).max(TINY);
+        let [[r, s], [t, u]] = self.warp;
+        // warp [[c, -b], [-b, a]] warpᵀ
+        [
+            r * r * c - 2.0 * r * s * b + s * s * a,
+            r * t * c - (r * u + s * t) * b + s * u * a,
+            t * t * c - 2.0 * t * u * b + u * u * a,
+        ]
+        .map(|value| scale * value)
     }
 
     /// How like the template the picture is at a place, and where it pulls.

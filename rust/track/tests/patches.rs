@@ -96,6 +96,61 @@ fn a_shift_is_found_though_the_light_has_changed() {
 }
 
 #[test]
+fn the_error_told_is_the_error_made_in_each_direction() {
+    // Steep across, gentle along: noise moves a patch further along.
+    let across = |x: f32, y: f32| 100.0 + 40.0 * (0.6 * x).sin() + 12.0 * (0.5 * y + 0.1 * x).cos();
+    let begun = places(400, 8);
+    let templates = taken(&drawn(across), &vec![1.0; SIDE * SIDE], &begun);
+    let mut off = [0.0f32; 2];
+    let mut told = [0.0f32; 2];
+    for seed in 0..20 {
+        let mut rng = fastrand::Rng::with_seed(seed);
+        let mut noisy = drawn(across);
+        for grey in &mut noisy {
+            *grey += 8.0 * (rng.f32() + rng.f32() + rng.f32() - 1.5);
+        }
+        let found = laid(&noisy, &templates, &begun, &upright(400));
+        for patch in (0..400).filter(|&patch| found.fits[patch]) {
+            for axis in 0..2 {
+                off[axis] += (found.places[patch][axis] - begun[patch][axis]).powi(2);
+                told[axis] += found.covariances[patch][2 * axis];
+            }
+        }
+    }
+    assert!(off[1] > 3.0 * off[0]);
+    for axis in 0..2 {
+        let ratio = (off[axis] / told[axis]).sqrt();
+        assert!((0.8..1.6).contains(&ratio), "axis {axis}: {ratio}");
+    }
+}
+
+#[test]
+fn a_covariance_turns_with_the_warp() {
+    let begun = places(50, 9);
+    let templates = taken(&drawn(texture), &vec![1.0; SIDE * SIDE], &begun);
+    // The same picture on its side: right is down, and down is left.
+    let side = drawn(|x, y| texture(y, SIDE as f32 - x));
+    let turned: Vec<[f32; 2]> = begun.iter().map(|[x, y]| [SIDE as f32 - y, *x]).collect();
+    let upright = laid(
+        &drawn(|x, y| texture(x, y) + 5.0 * (1.7 * x).sin()),
+        &templates,
+        &begun,
+        &upright(50),
+    );
+    let side = {
+        let ripple = drawn(|_, y| 5.0 * (1.7 * y).sin());
+        let grey: Vec<f32> = side.iter().zip(&ripple).map(|(a, b)| a + b).collect();
+        laid(&grey, &templates, &turned, &vec![[[0.0, -1.0], [1.0, 0.0]]; 50])
+    };
+    for (a, b) in upright.covariances.iter().zip(&side.covariances) {
+        let size = a[0] + a[2];
+        assert!((a[0] - b[2]).abs() < 0.05 * size);
+        assert!((a[2] - b[0]).abs() < 0.05 * size);
+        assert!((a[1] + b[1]).abs() < 0.05 * size);
+    }
+}
+
+#[test]
 fn a_turned_patch_is_laid_by_its_warp() {
     let turn = 0.4f32;
     let (cos, sin) = (turn.cos(), turn.sin());
