@@ -12,14 +12,9 @@ from turning_object import K, TurningObject, rotation_errors, turning_object
 
 from bigs.motion.bundle import Anchor, Bundle, BundleConfig, adjust, alike, pose_covariances
 from bigs.motion.features import NOTHING
-from bigs.motion.tracker import (
-    GivenPoses,
-    TrackerConfig,
-    contradicted_frames,
-    pairs_to_match,
-    sustained_departure,
-    track_matches,
-)
+from bigs.motion.given_poses import GivenPoses, contradicted_frames, pairs_to_match
+from bigs.motion.tracker import sustained_departure, track_matches
+from bigs.motion.tracker_config import TrackerConfig
 
 FRAMES = 20
 CONFIG = TrackerConfig()

@@ -25,7 +25,9 @@ from bigs.commands.folder.contents import write_json
 from bigs.data.base import Clip
 from bigs.data.ground_truth import load_annotation
 from bigs.hand import load_hand_models
-from bigs.motion.tracker import GivenPoses, TrackerConfig, track
+from bigs.motion.given_poses import GivenPoses
+from bigs.motion.tracker import track
+from bigs.motion.tracker_config import TrackerConfig
 from bigs.preprocess.artefacts import Alignment
 from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.initial import object_in_camera, smooth_object

@@ -7,7 +7,7 @@ from typing import Literal
 
 from bigs.models.hand_splats import HandSplatsConfig
 from bigs.models.object_splats import ObjectSplatsConfig
-from bigs.motion.tracker import TrackerConfig
+from bigs.motion.tracker_config import TrackerConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.plan.densify_config import DensifyConfig
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
@@ -98,7 +98,7 @@ class GraspStage:
 class ObjectMotionStage:
     """The object's motion from tracks in its pictures, found before anything is built on it.
 
-    See `motion.tracker`. It is the first stage of a plan that has it.
+    See `motion.tracker_config`. It is the first stage of a plan that has it.
     """
 
     name: str = "object-motion"

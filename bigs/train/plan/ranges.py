@@ -16,7 +16,7 @@ from bigs.motion.focal import FocalConfig
 from bigs.motion.follow import FollowConfig
 from bigs.motion.object_map import MapConfig
 from bigs.motion.patches import PatchConfig
-from bigs.motion.tracker import TrackerConfig
+from bigs.motion.tracker_config import TrackerConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.plan.config import (
     GraspStage,

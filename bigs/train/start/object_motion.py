@@ -17,7 +17,8 @@ from bigs.atomic import atomic_write
 from bigs.data.base import Clip
 from bigs.geometry.arrays import float32
 from bigs.models.poses import PoseErrors
-from bigs.motion.tracker import GivenPoses, TrackedMotion, track
+from bigs.motion.given_poses import GivenPoses
+from bigs.motion.tracker import TrackedMotion, track
 from bigs.threads import side_by_side
 from bigs.train.plan.config import ObjectMotionStage
 from bigs.train.plan.start_config import InitialConfig

@@ -12,7 +12,8 @@ import pytest
 from command_line import Answer, assert_refused
 
 import bigs.commands.bench.motion as bench_motion
-from bigs.motion.tracker import GivenPoses, TrackedMotion
+from bigs.motion.given_poses import GivenPoses
+from bigs.motion.tracker import TrackedMotion
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
-from bigs.motion.tracker import GivenPoses, TrackedMotion
+from bigs.motion.given_poses import GivenPoses
+from bigs.motion.tracker import TrackedMotion
 from bigs.train.check_plan import check_plan
 from bigs.train.fit import fit
 from bigs.train.plan.config import ObjectMotionStage, OptimizeStage, RunConfig
