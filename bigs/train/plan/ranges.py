@@ -128,11 +128,16 @@ RANGES: dict[type, dict[str, Range]] = {
     FollowConfig: {"levels": _COUNT, "half": Range(1, 100), "guides": _COUNT},
     FocalConfig: {
         "calibrated": _SHARE,
-        **dict.fromkeys(("calibrated_sigma", "guessed_sigma", "pixel_sigma", "caution"), _POSITIVE),
+        **dict.fromkeys(("calibrated_sigma", "guessed_sigma", "caution"), _POSITIVE),
         "most_observations": _COUNT,
     },
     MapConfig: {"keep_error": _POSITIVE, "least_observations": Range(2, 10**6)},
-    PatchConfig: {"max_side": Range(16, 1 << 16), "half": Range(1, 100), "neighbours": Range(3, 1000)},
+    PatchConfig: {
+        "max_side": Range(16, 1 << 16),
+        "half": Range(1, 100),
+        "neighbours": Range(3, 1000),
+        **dict.fromkeys(("least_error", "unrecognised_error"), _POSITIVE),
+    },
     BundleConfig: {
         "pixel_sigma": _POSITIVE,
         "turn_sigma": _POSITIVE,
