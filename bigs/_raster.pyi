@@ -197,8 +197,10 @@ def lay_patches(
     half: int,
     iterations: int,
     limits: tuple[float, float, float, float],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Flat places at which patches come to lie on a picture [2, H, W], and which fit.
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Flat places at which patches come to lie on a picture [2, H, W], their covariances, and which fit.
+
+    A covariance has three numbers: right right, right down, down down.
 
     Templates are grey values [N, S], slopes [N, S, 2] and weights [N, S]; starts [N, 2], warps [N, 2, 2].
     `limits` are the least share shown, the least likeness, the most moved and the most unsure, in pixels.

@@ -109,8 +109,8 @@ def sort_observations(
             _Batch(rows, slice(began, until), starts, here, used, slot, pairs, slot[pairs], owner[pairs])
         )
         began, row = until, rows.stop
-    ordered = (np.ascontiguousarray(values[order].T) for values in (pixels, precision))
-    return Observations(order, frame, rank, *ordered, points[by_time], batches)
+    pixels, precision = (np.ascontiguousarray(values[order].T) for values in (pixels, precision))
+    return Observations(order, frame, rank, pixels, precision, points[by_time], batches)
 
 
 def linearise(

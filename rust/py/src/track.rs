@@ -63,7 +63,7 @@ pub(crate) fn cut_patches<'py>(
 ///
 /// `templates` are grey `[N, S]`, slopes `[N, S, 2]` and weights `[N, S]`, which begin at `starts` `[N, 2]` and are
 /// turned by `warps` `[N, 2, 2]`; `limits` are the least share shown, likeness, most moved, most unsure. Returns places
-/// `[N * 2]`, and which `[N]` fit.
+/// `[N * 2]`, their covariances `[N * 3]`, and which `[N]` fit.
 #[pyfunction]
 pub(crate) fn lay_patches<'py>(
     py: Python<'py>,
