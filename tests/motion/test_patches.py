@@ -100,6 +100,20 @@ def test_patches_count_by_what_they_say_and_what_was_not_recognised_little(filme
     assert np.median(off[sure]) < 0.8 * np.median(off[~sure])
 
 
+def test_optimism_and_the_least_error_say_how_much_a_patch_is_believed(filmed: Filmed) -> None:
+    def errors(**settings: float) -> np.ndarray:
+        config = PatchConfig(passes=1, **settings)
+        found = copy.deepcopy(filmed.map)
+        sharpen(found, Pictures(filmed.images, filmed.masks, config), config)
+        matrices = found.precision[:, [0, 1, 1, 2]].reshape(-1, 2, 2) / found.config.bundle.pixel_sigma**2
+        errors = 1.0 / np.sqrt(np.linalg.eigvalsh(matrices))
+        return errors[~np.isclose(errors[:, 1], config.unrecognised_error)]
+
+    usual, doubled = errors(least_error=1e-4), errors(least_error=1e-4, optimism=4.0)
+    assert np.median(doubled) == pytest.approx(2.0 * np.median(usual), rel=1e-3)
+    assert errors(least_error=0.1).min() == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize("grey", [0, 128])
 def test_even_pictures_leave_the_matches_in_force(filmed: Filmed, grey: int) -> None:
     even = [np.full_like(image, grey) for image in filmed.images]
