@@ -164,6 +164,21 @@ def inlier_points(points: np.ndarray, neighbours: int = 6, factor: float = 3.0) 
     return mean < factor * np.median(mean)
 
 
+def plane_scatter(points: np.ndarray, normals: np.ndarray, neighbours: int = 8) -> float:
+    """How far points [N, 3] lie off the surface, metres: a robust standard deviation along their normals.
+
+    Each is compared with the planes of its nearest `neighbours`, by their unit normals [N, 3].
+    """
+    count = min(neighbours, len(points) - 1)
+    if count < 1:
+        return 0.0
+    _, index = scipy.spatial.cKDTree(points).query(points, k=count + 1, workers=-1)
+    others = index[:, 1:]
+    off = ((points[:, None] - points[others]) * normals[others]).sum(-1).mean(1)
+    # The mean of the planes scatters, too.
+    return float(1.4826 * np.median(np.abs(off)) / np.sqrt(1.0 + 1.0 / count))
+
+
 def blend_with_points(
     grid: DistanceGrid,
     points: np.ndarray,
@@ -173,14 +188,19 @@ def blend_with_points(
 ) -> DistanceGrid:
     """Replace a grid's distance near points by the distance to their planes (moving least squares).
 
+    The hull bounds the object from outside, but points scatter. If planes could only go inwards from it, the
+    surface would follow the inner half of their errors wherever the hull is tight, as it is under rough
+    outlines. So they may go outwards as far as the points scatter.
+
     Args:
         grid: distances to the hull.
         points: [N, 3] metres.
         normals: [N, 3] unit, outward.
         reach: metres; at this distance from the nearest point the grid's own value is back in full.
+        neighbours: number of planes that are averaged.
 
     Returns:
-        A new grid. It never reaches outside the old one: the hull is an upper bound of the object.
+        A new grid. It reaches outside the old one by no more than `plane_scatter` of the points.
     """
     corners = grid.points()
     values = grid.values.ravel().copy()
@@ -197,7 +217,8 @@ def blend_with_points(
     plane = (weights * plane).sum(1) / weights.sum(1)
     share = 1.0 - distance[:, 0] / reach
     share = share * share * (3.0 - 2.0 * share)
-    values[near] = np.maximum(share * plane + (1.0 - share) * values[near], values[near])
+    least = values[near] - share * plane_scatter(points, normals, neighbours)
+    values[near] = np.maximum(share * plane + (1.0 - share) * values[near], least)
     return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)
 
 

@@ -15,6 +15,7 @@ from bigs.geometry.surface import (
     empty_grid,
     extract_mesh,
     inlier_points,
+    plane_scatter,
     silhouette_around_points,
     silhouette_distance,
 )
@@ -227,6 +228,36 @@ def test_points_carve_a_hollow_that_silhouettes_cannot_show() -> None:
     far = scipy.spatial.cKDTree(bottom).query(grid.points())[0] > 0.0501
     np.testing.assert_array_equal(blended.values.ravel()[far], grid.values.ravel()[far])
     np.testing.assert_array_equal(ball_grid().values, grid.values)  # the old grid is left alone
+
+
+def test_scattered_points_do_not_shrink_what_a_tight_hull_bounds() -> None:
+    grid, spread = ball_grid(), 0.0008
+    directions = even_directions(6000)
+    off = spread * np.random.default_rng(0).standard_normal(len(directions))
+    points = MIDDLE + (RADIUS + off)[:, None] * directions
+    blended = blend_with_points(grid, points, directions, reach=0.016)
+
+    def mean_radius(surface: DistanceGrid) -> float:
+        return np.linalg.norm(extract_mesh(surface)[0] - MIDDLE, axis=1).mean()
+
+    assert mean_radius(blended) == pytest.approx(RADIUS, abs=5e-5)
+    # What planes say that may only go inwards.
+    inner = replace(blended, values=np.maximum(blended.values, grid.values))
+    assert mean_radius(inner) < RADIUS - 1e-4
+    scatter = plane_scatter(points, directions)
+    assert scatter == pytest.approx(spread, rel=0.1)
+    assert (grid.values - blended.values).max() <= scatter
+    # A point that is far off is not followed.
+    points[0] += 0.01 * directions[0]
+    stray = blend_with_points(grid, points, directions, reach=0.016)
+    assert (grid.values - stray.values).max() <= plane_scatter(points, directions) < 1.1 * scatter
+
+
+def test_points_on_their_planes_do_not_scatter() -> None:
+    flat = np.concatenate([np.random.default_rng(1).random((40, 2)), np.zeros((40, 1))], axis=1)
+    upwards = np.tile([0.0, 0.0, 1.0], (40, 1))
+    assert plane_scatter(flat, upwards) == 0.0
+    assert plane_scatter(flat[:1], upwards[:1]) == 0.0  # nothing to compare it with
 
 
 def test_mesh_of_a_ball_is_closed_and_looks_outwards() -> None:

@@ -73,8 +73,9 @@ def build_scene(
         hand_models: both sides' models in their files' own conventions.
         initial, hand, obj: see those classes.
         lighting: whether colours depend on the direction a surface faces.
-        completion: where much of the object was never seen, its symmetries are looked for; if it has none,
-            hands meet nothing there. Otherwise, and without it, they meet the closed surface.
+        completion: where much of the object was never seen, its symmetries are looked for, and hands meet
+            what they make of it; if it has none, hands meet nothing there. Otherwise, and without it, they
+            meet the closed surface.
         motion: of the object, if tracks were used; it replaces the smoothed estimates.
     """
     starts = {
@@ -175,8 +176,12 @@ def _object_surfaces(
         known = KnownPart(torch.as_tensor(verts), torch.as_tensor(faces), left_out)
     symmetries: list[Symmetry] = []
     if completion is not None and support.guessed(initial.surface_solid) > initial.surface_guessed:
-        symmetries = complete(hull, start, initial, completion).symmetries
-        if not symmetries:
+        done = complete(hull, start, initial, completion)
+        symmetries = done.symmetries
+        if symmetries:
+            # A hull of few directions is deep: its far side is no surface that a hand could hold.
+            grid = done.surface
+        else:
             grid = support.without_guesses(grid, initial.surface_solid)
     return _ObjectSurfaces(closed, known, grid, symmetries, [])
 
