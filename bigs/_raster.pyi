@@ -251,11 +251,11 @@ class TouchState:
 # points [V, 3] or [B, V, 3], weights [V, K], bones [B, K, 4, 4], rotations [B, 3, 3], centers [B, 3],
 # scale [], values [Z, Y, X], bounds [2, 3].
 _Touch = tuple[NDArray[Any], ...]
-# Whether the hand is mirrored, how many vertices count, and the tolerance.
-_TouchOptions = tuple[bool, int, float]
+# Whether the hand is mirrored, for each of G groups how many of which vertices count, and the tolerance.
+_TouchOptions = tuple[bool, tuple[tuple[int, tuple[int, ...] | None], ...], float]
 
 def touch_forward(arrays: _Touch, options: _TouchOptions) -> tuple[NDArray[Any], NDArray[Any], TouchState]:
-    """Depths [B] and sums of squares [B] of what is sunk."""
+    """Flat depths [B, G] and sums of squares [B] of what is sunk."""
 
 def touch_backward(
     state: TouchState, arrays: _Touch, options: _TouchOptions, pulls: list[NDArray[Any] | None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,10 +14,17 @@ from bigs.fused.arrays import array, array_or_none, shaped
 from bigs.fused.posing import Posing
 
 
+class Group(NamedTuple):
+    """Vertices of which those that reach furthest count: the whole hand, or a finger."""
+
+    deepest: int  # how many of a frame's least distances are averaged, all of them if there are fewer
+    vertices: tuple[int, ...] | None = None  # rising; None for all
+
+
 class Touch(NamedTuple):
     """What touches in B frames."""
 
-    depths: Tensor  # [B] mean of the least signed distances of a frame, in the points' unit
+    depths: Tensor  # [B, G] mean of the least signed distances of each group, in the points' unit
     sunk: Tensor  # [B] sum over vertices of max(-d - tolerance, 0)^2 for signed distances d
 
 
@@ -42,31 +50,33 @@ def touch(
     scale: Tensor,
     values: Tensor,
     bounds: Tensor,
-    deepest: int,
+    groups: Sequence[Group],
     tolerance: float,
 ) -> Touch:
-    """What of a hand touches an object; vertices that count for neither number cost no gradient.
+    """What of a hand touches an object; vertices that count for no number cost no gradient.
 
     Args:
         hand: V vertices in B frames; only points, weights, bones and `mirrored` count, weights without
             gradient.
         rotations, centers, scale: [B, 3, 3], [B, 3] and []; the object's point p is at scale R p + centre.
         values, bounds: as in `distances`, at scale 1; no gradient.
-        deepest: how many of a frame's least distances are averaged.
+        groups: of its vertices, at most 32.
         tolerance: depth that does not count as sunk.
     """
     tensors = (hand.points, hand.weights, hand.bones, rotations, centers, scale, values, bounds)
-    return Touch(*_Touch.apply((hand.mirrored, deepest, tolerance), *tensors))
+    return Touch(*_Touch.apply((hand.mirrored, tuple(groups), tolerance), *tensors))
 
 
 class _Touch(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, options: tuple[bool, int, float], *tensors: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, options: tuple[bool, tuple[Group, ...], float], *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(*tensors)
         ctx.options = options
         ctx.set_materialize_grads(False)
         depths, sunk, ctx.state = _raster.touch_forward(tuple(map(array, tensors)), options)
-        return torch.from_numpy(depths), torch.from_numpy(sunk)
+        return torch.from_numpy(depths).view(len(sunk), -1), torch.from_numpy(sunk)
 
     @staticmethod
     @once_differentiable

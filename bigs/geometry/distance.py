@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from bigs.fused import touch as fused
 from bigs.fused.posing import Posing
-from bigs.fused.touch import Touch
+from bigs.fused.touch import Group, Touch
 from bigs.geometry.surface import DistanceGrid
+
+# What reaches furthest of a hand: a fingertip's worth of its vertices.
+WHOLE_HAND = Group(30)
 
 
 class DistanceField(nn.Module):
@@ -36,8 +41,8 @@ class DistanceField(nn.Module):
         rotations: Tensor,
         centers: Tensor,
         scale: Tensor,
-        deepest: int = 30,
+        groups: Sequence[Group] = (WHOLE_HAND,),
         tolerance: float = 0.001,
     ) -> Touch:
         """What of a hand touches the object in B poses; see `bigs.fused.touch.touch`."""
-        return fused.touch(hand, rotations, centers, scale, self.values, self.bounds, deepest, tolerance)
+        return fused.touch(hand, rotations, centers, scale, self.values, self.bounds, groups, tolerance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ from bigs.types import Side
 
 # MANO's joint order: wrist, then three joints each of index, middle, pinky, ring and thumb.
 MANO_PARENTS: tuple[int, ...] = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
+# Of the four fingers, not of the thumb.
+_OUTERMOST = (3, 6, 9, 12)
 JOINT_NAMES: tuple[str, ...] = (
     "wrist",
     *(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)),
@@ -101,6 +104,12 @@ class HandModel(nn.Module):
         # Most other models have no correctives, and the product with zeros would be the largest cost of a
         # pose.
         self.has_posedirs = bool(self.posedirs.any())
+
+    @cached_property
+    def fingertips(self) -> tuple[tuple[int, ...], ...]:
+        """Vertices that most follow the outermost segments of index, middle, pinky and ring."""
+        leading = self.lbs_weights.argmax(dim=1)
+        return tuple(tuple((leading == joint).nonzero()[:, 0].tolist()) for joint in _OUTERMOST)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Vertices [..., V, 3] of the shape `betas` [..., 10] in the rest pose, metres."""

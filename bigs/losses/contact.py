@@ -17,13 +17,13 @@ def center_contact(object_centers: Tensor, wrists: Tensor, touching: Tensor) -> 
 
 
 def surface_gaps(depths: Tensor, reach: float = 0.01) -> Tensor:
-    """How far the part of a hand that reaches furthest is from the object's surface, [B] in [0, 1).
+    """How far the part of a hand that reaches furthest is from the object's surface, [...] in [0, 1).
 
     |d| / (|d| + reach) of its mean distance d: it saturates, so that a frame whose pose is wrong altogether
     does not outweigh the rest.
 
     Args:
-        depths: [B] mean of the least signed distances of the hand's vertices, metres. It is zero when that
+        depths: [...] mean of the least signed distances of a hand's vertices, metres. It is zero when that
             part lies on the surface; the least *absolute* distances would also be near zero for a hand that
             is stuck deep inside, where some vertices always cross it.
         reach: metres at which the pull has fallen by half.
@@ -40,6 +40,16 @@ def surface_contact(depths: Tensor, touching: Tensor) -> Tensor:
         touching: [B] in [0, 1], how sure it is that the hand touches the object.
     """
     return (surface_gaps(depths) * touching).sum() / touching.sum().clamp_min(1.0)
+
+
+def fingers_on_surface(depths: Tensor, holding: Tensor) -> Tensor:
+    """Mean of `surface_gaps` over fingers and over the frames that hold: draws each to the surface by itself.
+
+    Args:
+        depths: [B, F] mean of the least signed distances of each fingertip's vertices, metres.
+        holding: [B] in [0, 1], how sure it is that the hand holds the object.
+    """
+    return (surface_gaps(depths).mean(dim=1) * holding).sum() / holding.sum().clamp_min(1.0)
 
 
 def penetration(sunk: Tensor) -> Tensor:

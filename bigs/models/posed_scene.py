@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from bigs.fused.posing import Posing, skin
-from bigs.fused.touch import Touch
+from bigs.fused.touch import Group, Touch
+from bigs.geometry.distance import WHOLE_HAND
 from bigs.hand import Skeleton, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.hand_splats import pose_splats, rest_points
@@ -20,6 +21,9 @@ from bigs.types import Entity, Gaussians, Side
 
 if TYPE_CHECKING:
     from bigs.models.scene import Scene
+
+# Vertices of a fingertip that touch when it does.
+_PAD = 5
 
 
 class PosedScene:
@@ -85,8 +89,9 @@ class PosedScene:
         return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
     def touch(self, side: Side) -> Touch:
-        """What of a hand touches the object's surface, metres."""
-        return self._scene.object_distance.touch(self.posing(side), *self.object)
+        """What touches the object's surface, metres: of the whole hand, then of each of its `fingertips`."""
+        tips = (Group(_PAD, tip) for tip in self._scene.hand_model(side).fingertips)
+        return self._scene.object_distance.touch(self.posing(side), *self.object, (WHOLE_HAND, *tips))
 
     def posing(self, side: Side, vertices: Tensor | None = None) -> Posing:
         """What carries a hand's vertices, or some of them (indices), to camera space."""

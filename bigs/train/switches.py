@@ -205,8 +205,8 @@ _INGREDIENTS = {
         _all_of(_terms("smooth", "acceleration"), _smooth),
     ),
     "contact": Switch(
-        "contact and penetration, and the search of the object's size, which they decide",
-        _all_of(_terms("contact", "penetration"), _scale_search),
+        "contact of hands and fingers, penetration, and the search of the object's size, which they decide",
+        _all_of(_terms("contact", "finger_contact", "penetration"), _scale_search),
     ),
     "frame_poses": Switch("pose residuals of single frames", _groups(*_FRAME_POSES)),
     "object-motion": Switch(

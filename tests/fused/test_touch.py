@@ -8,7 +8,7 @@ from posing_twin import blended
 from torch import Tensor
 
 from bigs.fused.posing import Posing
-from bigs.fused.touch import Touch, distances, touch
+from bigs.fused.touch import Group, Touch, distances, touch
 from bigs.geometry.rotations import axis_angle_to_matrix
 
 FRAMES, VERTS, BONES, RADIUS = 3, 40, 2, 0.5
@@ -67,14 +67,19 @@ def twin(
     centers: Tensor,
     scale: Tensor,
     values: Tensor,
-    deepest: int,
+    groups: list[Group],
     tolerance: float,
 ) -> Touch:
     points = blended(posing)
     own = (points - centers[:, None]) @ rotations / scale
     found = scale * sampled(own, values)
     sunk = torch.relu(-found - tolerance).square().sum(1)
-    return Touch(found.topk(min(deepest, VERTS), dim=1, largest=False).values.mean(1), sunk)
+
+    def depth(group: Group) -> Tensor:
+        own = found if group.vertices is None else found[:, group.vertices]
+        return own.topk(min(group.deepest, own.shape[1]), dim=1, largest=False).values.mean(1)
+
+    return Touch(torch.stack([depth(group) for group in groups], dim=1), sunk)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -82,12 +87,13 @@ def twin(
 @pytest.mark.parametrize("deepest", [1, 7, 99])
 def test_what_touches_is_what_the_twin_finds(moving: bool, mirrored: bool, deepest: int) -> None:
     posing, object_frames, values = hand(moving, mirrored), carrier(), ball()
-    found = touch(posing, *object_frames, values, BOUNDS, deepest, 0.02)
-    expected = twin(posing, *object_frames, values, deepest, 0.02)
+    groups = [Group(deepest), Group(3, (0, 2, 5, 11, 17)), Group(deepest, (39,))]
+    found = touch(posing, *object_frames, values, BOUNDS, groups, 0.02)
+    expected = twin(posing, *object_frames, values, groups, 0.02)
     assert (expected.sunk > 0).all()
     inputs = (posing.points, posing.bones, *object_frames)
-    pull = torch.tensor([0.7, -1.3, 0.4], dtype=torch.float64)
-    for a, b in zip(found, expected, strict=True):
+    pulls = random(FRAMES, len(groups), seed=7), torch.tensor([0.7, -1.3, 0.4], dtype=torch.float64)
+    for a, b, pull in zip(found, expected, pulls, strict=True):
         torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-10)
         one, other = (torch.autograd.grad(v, inputs, pull, retain_graph=True) for v in (a, b))
         for x, y in zip(one, other, strict=True):
@@ -98,7 +104,9 @@ def test_gradients_are_finite_differences() -> None:
     posing = hand(moving=False, mirrored=True)
 
     def both(points: Tensor, bones: Tensor, *object_frames: Tensor) -> tuple[Tensor, Tensor]:
-        return touch(posing._replace(points=points, bones=bones), *object_frames, ball(), BOUNDS, 7, 0.02)
+        moved = posing._replace(points=points, bones=bones)
+        groups = [Group(7), Group(2, (1, 4, 30))]
+        return touch(moved, *object_frames, ball(), BOUNDS, groups, 0.02)
 
     assert torch.autograd.gradcheck(both, (posing.points, posing.bones, *carrier()), eps=1e-7, atol=1e-5)
 
@@ -107,8 +115,8 @@ def test_single_precision_is_near_double() -> None:
     posing, object_frames = hand(moving=False, mirrored=False), carrier()
     single = Posing(*(None if t is None else t.detach().float() for t in posing[:-1]))
     others = (t.detach().float() for t in (*object_frames, ball(), BOUNDS))
-    found = touch(single, *others, 7, 0.02)
-    for a, b in zip(found, touch(posing, *object_frames, ball(), BOUNDS, 7, 0.02), strict=True):
+    found = touch(single, *others, [Group(7)], 0.02)
+    for a, b in zip(found, touch(posing, *object_frames, ball(), BOUNDS, [Group(7)], 0.02), strict=True):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a.double(), b, atol=1e-5, rtol=1e-4)
 
@@ -122,7 +130,7 @@ def test_of_equal_distances_as_many_count_as_are_asked_for() -> None:
     )
     still = torch.eye(3, dtype=torch.float64).expand(FRAMES, 3, 3)
     centers, scale = torch.zeros(FRAMES, 3, dtype=torch.float64), torch.ones((), dtype=torch.float64)
-    found = touch(posing, still, centers, scale, ball(), BOUNDS, 3, 0.02)
+    found = touch(posing, still, centers, scale, ball(), BOUNDS, [Group(3)], 0.02)
     (pull,) = torch.autograd.grad(found.depths.sum(), posing.points)
     assert (pull != 0).any(1).sum() == 3
     assert not found.sunk.any()
@@ -132,9 +140,9 @@ def test_poses_that_are_not_finite_show() -> None:
     posing, (rotations, centers, scale) = hand(moving=False, mirrored=False), carrier()
     centers = centers.detach().clone()
     centers[1] = torch.nan
-    found = touch(posing, rotations, centers, scale, ball(), BOUNDS, 7, 0.02)
+    found = touch(posing, rotations, centers, scale, ball(), BOUNDS, [Group(7)], 0.02)
     for values in found:
-        assert values.isnan().tolist() == [False, True, False]
+        assert values.view(FRAMES).isnan().tolist() == [False, True, False]
 
 
 def test_distances_are_samples_of_the_grid() -> None:
@@ -150,6 +158,9 @@ def test_what_does_not_fit_is_refused() -> None:
         posing._replace(points=posing.points[:0], weights=posing.weights[:0]),
     ):
         with pytest.raises(ValueError, match="expected"):
-            touch(wrong, *object_frames, ball(), BOUNDS, 7, 0.02)
+            touch(wrong, *object_frames, ball(), BOUNDS, [Group(7)], 0.02)
+    for group in (Group(0), Group(1, ()), Group(1, (VERTS,)), Group(1, (3, 2))):
+        with pytest.raises(ValueError, match="groups: expected rising vertices"):
+            touch(posing, *object_frames, ball(), BOUNDS, [group], 0.02)
     with pytest.raises(ValueError, match="at least two along each axis"):
-        touch(posing, *object_frames, ball((1, 14, 13)), BOUNDS, 7, 0.02)
+        touch(posing, *object_frames, ball((1, 14, 13)), BOUNDS, [Group(7)], 0.02)

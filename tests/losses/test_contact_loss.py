@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bigs.losses.contact import center_contact, penetration, surface_contact
+from bigs.losses.contact import center_contact, fingers_on_surface, penetration, surface_contact
 
 
 def test_center_contact_is_the_mean_distance_while_touching() -> None:
@@ -38,6 +38,21 @@ def test_contact_saturates_and_asks_only_where_the_image_shows_touch() -> None:
     assert surface_contact(both, torch.zeros(2)) == 0.0
 
 
+def test_each_finger_is_drawn_by_itself_while_the_hand_holds() -> None:
+    fingers = torch.tensor([[0.0, 0.01], [-0.03, 0.5]], dtype=torch.float64, requires_grad=True)
+    holding = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    loss = fingers_on_surface(fingers, holding)
+    assert loss.item() == pytest.approx(0.25)
+    (pull,) = torch.autograd.grad(loss, fingers)
+    assert pull[0, 1] > 0 and pull[0, 0] == 0 and not pull[1].any()
+    # A hand that reaches the surface as a whole is no reason for a finger to stand off.
+    assert surface_contact(fingers.detach()[:, 0], holding) == 0.0
+    # A finger that is far off is hardly drawn, and a doubtful grasp as far as it is sure.
+    (far,) = torch.autograd.grad(fingers_on_surface(fingers, torch.tensor([0.0, 0.5])), fingers)
+    assert 0 < far[1, 1] < 0.02 * pull[0, 1] and far[1, 0] < 0
+    assert fingers_on_surface(fingers, torch.zeros(2)) == 0.0
+
+
 def test_penetration_is_in_squared_centimetres() -> None:
     assert penetration(torch.tensor([1e-4, 9e-4])).item() == pytest.approx((1.0 + 9.0) / 2, rel=1e-5)
     assert penetration(torch.zeros(2)) == 0.0
@@ -51,6 +66,8 @@ def test_gradients() -> None:
     assert torch.autograd.gradcheck(
         lambda d: surface_contact(d, touching), depths(0.01, -0.02, 0.3), eps=1e-7
     )
+    fingers = depths(0.01, -0.02, 0.3, 0.02, 0.005, -0.001).reshape(3, 2)
+    assert torch.autograd.gradcheck(lambda d: fingers_on_surface(d, touching), fingers, eps=1e-7)
     centers, wrists = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(lambda c, w: center_contact(c, w, touching), (centers, wrists))
     # A wrist exactly in the centre must not poison the step.

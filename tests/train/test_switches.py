@@ -65,7 +65,7 @@ def test_the_papers_switches() -> None:
     assert not {"smooth", "acceleration"} & weights(smooth)
     assert weights(PAPER) - weights(without(PAPER, "smooth")) == {"smooth"}
     contact = without(FAST, "contact")
-    assert weights(FAST) - weights(contact) == {"contact", "penetration"}
+    assert weights(FAST) - weights(contact) == {"contact", "finger_contact", "penetration"}
     assert ScaleSearchStage in kinds(FAST) and ScaleSearchStage not in kinds(contact)
     # Without per-frame poses the paper's second step has nothing to move.
     assert [stage.name for stage in without(PAPER, "frame_poses").stages][:2] == ["hands", "object"]

@@ -63,7 +63,7 @@ def search_object_scale(
         scene.object_poses.log_scale.copy_(start + factor.log())
         carrier = scene.object_poses(frames)
         for side, hand in hands.items():
-            gaps[side][c] = surface_gaps(scene.object_distance.touch(hand, *carrier).depths)
+            gaps[side][c] = surface_gaps(scene.object_distance.touch(hand, *carrier).depths[:, 0])
         hidden[c] = stage.labels_weight * occlusion()
     scene.object_poses.log_scale.copy_(start)
     costs = _costs(gaps, touching) + hidden

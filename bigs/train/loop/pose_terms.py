@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bigs.losses.contact import center_contact, penetration, surface_contact
+from bigs.losses.contact import center_contact, fingers_on_surface, penetration, surface_contact
 from bigs.losses.regularizers import finger_unevenness, impossible_turn, squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.losses.weighted import mean_of
@@ -121,7 +121,23 @@ def contact(step: Step) -> Tensor:
             for side, joints in step.joints.items()
         )
     return mean_of(
-        surface_contact(touch.depths, step.evidence.touching[side]) for side, touch in step.touches.items()
+        surface_contact(touch.depths[:, 0], step.evidence.touching[side])
+        for side, touch in step.touches.items()
+    )
+
+
+def finger_contact(step: Step) -> Tensor:
+    """Fingers that hold the object touch it, whether a picture shows them or not; a mean over holding hands.
+
+    Not thumbs: they often stand off.
+    """
+    if not step.has_object:
+        return torch.zeros(())
+    grasps = step.scene.grasps
+    return mean_of(
+        fingers_on_surface(touch.depths[:, 1:], grasps[side].certainty)
+        for side, touch in step.touches.items()
+        if grasps[side].count
     )
 
 

@@ -138,6 +138,7 @@ TERMS: dict[str, Term] = {
         shade_prior=pose_terms.shade_prior,
         rigid=pose_terms.rigid,
         contact=pose_terms.contact,
+        finger_contact=pose_terms.finger_contact,
         penetration=pose_terms.penetrating,
     ),
 }

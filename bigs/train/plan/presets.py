@@ -95,7 +95,7 @@ _CONTACT = OptimizeStage(
     step="interacting-subjects",
     steps=50,
     lrs=_GRASPED_RATES,
-    weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "penetration": 0.01},
+    weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "finger_contact": 0.1, "penetration": 0.01},
     image_size=160,
     stop_patience=_SETTLED,
 )
@@ -145,6 +145,7 @@ _PLAUSIBLE_TOGETHER = {
     "depth_prior": 12.0,
     "rigid": 0.03,
     "contact": 0.1,
+    "finger_contact": 0.1,
     "penetration": 0.01,
     "object_acceleration": 0.005,
     "object_prior": 0.1,

@@ -2,14 +2,13 @@
 //!
 //! Hardly any vertex of a hand touches: of all others only the distance is computed, and gradients leave them out.
 
-use std::cmp::Ordering;
-
 use bigs_raster::Vectors;
 use rayon::prelude::*;
 
 use crate::OpsError;
 use crate::checks::check_length;
 use crate::distance::{Grid, Sampler};
+use crate::groups::{Deepest, Group, MOST_GROUPS};
 use crate::mat3::add;
 use crate::pose::{Pose, Subject};
 
@@ -35,7 +34,7 @@ pub struct Touch<'a, T> {
     object: Object<'a, T>,
     /// 1 / scale.
     per_scale: T,
-    deepest: usize,
+    groups: Vec<Deepest>,
     tolerance: T,
     frames: usize,
 }
@@ -43,7 +42,7 @@ pub struct Touch<'a, T> {
 /// What touches, and what gradients need.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Touched<T> {
-    /// B: the mean of the least signed distances, in the unit of the points.
+    /// B × G: the mean of the least signed distances of each group, in the unit of the points.
     pub depths: Vec<T>,
     /// B: the sum over vertices of squared depths below the tolerance.
     pub sunk: Vec<T>,
@@ -56,8 +55,8 @@ struct Counted<T> {
     vertex: usize,
     point: [T; 3],
     distance: T,
-    /// Whether it is one of the deepest.
-    deepest: bool,
+    /// The groups, bit by bit, of whose deepest it is one.
+    groups: u32,
 }
 
 /// Gradients of all inputs but weights and grid.
@@ -85,27 +84,30 @@ impl<'a, T: Vectors> Touch<'a, T> {
     /// Checks lengths.
     ///
     /// * `hand`: its vertices; a surface is not looked at
-    /// * `deepest`: how many of a frame's least distances are averaged, all of them if there are fewer
+    /// * `groups`: what of it is to reach the surface, at most 32
     /// * `tolerance`: depth that does not count as sunk
     ///
     /// # Errors
-    /// A length that does not fit, or a hand without vertices.
+    /// A length that does not fit, or groups that are too many, are empty or name vertices that there are not.
     pub fn new(
         hand: Subject<'a, T>,
         object: Object<'a, T>,
-        deepest: usize,
+        groups: &[Group],
         tolerance: T,
     ) -> Result<Self, OpsError> {
         let frames = object.centers.len();
         check_length("rotations", frames, object.rotations.len())?;
-        let least = hand.count.min(deepest);
-        if least == 0 {
+        if groups.len() > MOST_GROUPS {
             return Err(OpsError::BadSize {
-                name: "points",
-                expected: "at least one, and one that counts",
-                got: least,
+                name: "groups",
+                expected: "at most 32",
+                got: groups.len(),
             });
         }
+        let groups = groups
+            .iter()
+            .map(|group| Deepest::of(group, hand.count))
+            .collect::<Result<_, _>>()?;
         let hand = Subject {
             surface: None,
             ..hand
@@ -115,7 +117,7 @@ impl<'a, T: Vectors> Touch<'a, T> {
             pose: Pose::new(frames, vec![hand], None, false)?,
             object,
             per_scale: T::ONE / object.scale,
-            deepest: least,
+            groups,
             tolerance,
             frames,
         })
@@ -128,64 +130,60 @@ impl<'a, T: Vectors> Touch<'a, T> {
     pub fn measure(&self) -> Result<Touched<T>, OpsError> {
         let points = self.pose.forward()?.means;
         let sampler = self.object.grid.sampler()?;
-        let each: Vec<(T, T, Vec<Counted<T>>)> = points
+        let each: Vec<(Vec<T>, T, Vec<Counted<T>>)> = points
             .par_chunks_exact(self.hand.count)
             .enumerate()
             .map(|(frame, points)| self.frame(frame, points, &sampler))
             .collect();
         let mut out = Touched {
-            depths: Vec::with_capacity(self.frames),
+            depths: Vec::with_capacity(self.frames * self.groups.len()),
             sunk: Vec::with_capacity(self.frames),
             counted: Vec::with_capacity(self.frames),
         };
-        for (depth, sunk, counted) in each {
-            out.depths.push(depth);
+        for (depths, sunk, counted) in each {
+            out.depths.extend(depths);
             out.sunk.push(sunk);
             out.counted.push(counted);
         }
         Ok(out)
     }
 
-    fn frame(&self, frame: usize, points: &[[T; 3]], sampler: &Sampler<'_, T>) -> (T, T, Vec<Counted<T>>) {
+    fn frame(
+        &self,
+        frame: usize,
+        points: &[[T; 3]],
+        sampler: &Sampler<'_, T>,
+    ) -> (Vec<T>, T, Vec<Counted<T>>) {
         let distances: Vec<T> = points
             .iter()
             .map(|&point| self.object.scale * sampler.distance(self.own(frame, point)))
             .collect();
-        let order = |a: &T, b: &T| a.as_f64().total_cmp(&b.as_f64());
-        let mut sorted = distances.clone();
-        let (less, &mut last, _) = sorted.select_nth_unstable_by(self.deepest - 1, order);
-        // Of equal distances the first are taken.
-        let mut equal = self.deepest - less.iter().filter(|d| order(d, &last).is_lt()).count();
-        let (mut sum, mut sunk) = (T::ZERO, T::ZERO);
-        let mut counted = Vec::with_capacity(2 * self.deepest);
+        let mut among = vec![0_u32; points.len()];
+        let depths = self
+            .groups
+            .iter()
+            .enumerate()
+            .map(|(g, group)| group.mark(&distances, &mut among, 1 << g))
+            .collect();
+        let mut sunk = T::ZERO;
+        let mut counted = Vec::new();
         for (vertex, (&point, &distance)) in points.iter().zip(&distances).enumerate() {
             let depth = self.depth(distance);
-            let deepest = match order(&distance, &last) {
-                Ordering::Less => true,
-                Ordering::Greater => false,
-                Ordering::Equal => {
-                    let taken = equal > 0;
-                    equal = equal.saturating_sub(1);
-                    taken
-                }
-            };
-            if deepest {
-                sum += distance;
-            }
             // True of a depth that is not a number, so that it shows in the sum.
             if depth != T::ZERO {
                 sunk += depth * depth;
             }
-            if deepest || depth != T::ZERO {
+            let groups = among[vertex];
+            if groups != 0 || depth != T::ZERO {
                 counted.push(Counted {
                     vertex,
                     point,
                     distance,
-                    deepest,
+                    groups,
                 });
             }
         }
-        (sum / T::of(self.deepest as f64), sunk, counted)
+        (depths, sunk, counted)
     }
 
     /// How much further than the tolerance a distance is inside; 0 outside.
@@ -211,7 +209,9 @@ impl<'a, T: Vectors> Touch<'a, T> {
         v_depths: Option<&[T]>,
         v_sunk: Option<&[T]>,
     ) -> Result<TouchGradients<T>, OpsError> {
-        check_length("v_depths", self.frames, v_depths.map_or(self.frames, <[_]>::len))?;
+        let count = self.groups.len();
+        let depths = self.frames * count;
+        check_length("v_depths", depths, v_depths.map_or(depths, <[_]>::len))?;
         check_length("v_sunk", self.frames, v_sunk.map_or(self.frames, <[_]>::len))?;
         check_length("depths", self.frames, touched.counted.len())?;
         let sampler = self.object.grid.sampler()?;
@@ -220,11 +220,16 @@ impl<'a, T: Vectors> Touch<'a, T> {
             .par_iter()
             .enumerate()
             .map(|(frame, counted)| {
-                let v_depth = v_depths.map_or(T::ZERO, |v| v[frame]) / T::of(self.deepest as f64);
+                let v_depths = v_depths.map_or(&[][..], |v| &v[frame * count..][..count]);
                 let v_sunk = v_sunk.map_or(T::ZERO, |v| v[frame]);
                 let pulls = counted.iter().map(|at| {
-                    let sunk = T::of(-2.0) * v_sunk * self.depth(at.distance);
-                    (at, sunk + if at.deepest { v_depth } else { T::ZERO })
+                    let mut pull = T::of(-2.0) * v_sunk * self.depth(at.distance);
+                    for (g, (&v, group)) in v_depths.iter().zip(&self.groups).enumerate() {
+                        if at.groups >> g & 1 == 1 {
+                            pull += v / T::of(group.count as f64);
+                        }
+                    }
+                    (at, pull)
                 });
                 self.frame_vjp(frame, pulls, &sampler)
             })

@@ -1,6 +1,7 @@
 //! What of a hand touches an object: gradients against finite differences, a case known by hand, and refusals.
 
 use bigs_ops::distance::Grid;
+use bigs_ops::groups::Group;
 use bigs_ops::joints::rotations;
 use bigs_ops::pose::Subject;
 use bigs_ops::touch::{Object, Touch, TouchGradients};
@@ -24,6 +25,20 @@ fn grid(values: &[f64]) -> Grid<'_, f64> {
         values,
         size: [6, 5, 4],
         bounds: [[-1.0, -1.2, -0.8], [1.1, 1.0, 0.9]],
+    }
+}
+
+fn whole(deepest: usize) -> Group {
+    Group {
+        deepest,
+        vertices: None,
+    }
+}
+
+fn some(deepest: usize, vertices: &[usize]) -> Group {
+    Group {
+        deepest,
+        vertices: Some(vertices.to_vec()),
     }
 }
 
@@ -63,9 +78,10 @@ impl Inputs {
             centers: threes(centers),
             scale: scale[0],
         };
-        let touch = Touch::new(hand, object, 4, 0.05).unwrap();
+        // Vertices 3 to 8 may count to both.
+        let touch = Touch::new(hand, object, &[whole(4), some(2, &[3, 4, 6, 8])], 0.05).unwrap();
         let touched = touch.measure().unwrap();
-        let (v_depths, v_sunk) = ([0.7, -1.1], [0.4, 0.9]);
+        let (v_depths, v_sunk) = ([0.7, -0.3, -1.1, 0.8], [0.4, 0.9]);
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         (
             dot(&touched.depths, &v_depths) + dot(&touched.sunk, &v_sunk),
@@ -108,7 +124,7 @@ fn gradients_are_finite_differences() {
 /// A hand of some points, which one bone leaves where they are, before a plane at x = 0: inside is below.
 fn before_a_plane<R>(
     points: &[[f64; 3]],
-    deepest: usize,
+    groups: &[Group],
     test: impl FnOnce(Result<Touch<'_, f64>, String>) -> R,
 ) -> R {
     let values: Vec<f64> = (0..8).map(|i| if i % 2 == 0 { -1.0 } else { 1.0 }).collect();
@@ -133,7 +149,7 @@ fn before_a_plane<R>(
         centers: &[[0.0; 3]],
         scale: 1.0,
     };
-    test(Touch::new(hand, object, deepest, 0.1).map_err(|error| error.to_string()))
+    test(Touch::new(hand, object, groups, 0.1).map_err(|error| error.to_string()))
 }
 
 #[test]
@@ -144,7 +160,7 @@ fn the_deepest_are_averaged_and_what_is_sunk_is_squared() {
         [-0.2, 0.3, 0.0],
         [0.1, 0.0, 0.4],
     ];
-    before_a_plane(&points, 3, |touch| {
+    before_a_plane(&points, &[whole(3)], |touch| {
         let touch = touch.unwrap();
         let touched = touch.measure().unwrap();
         // The way to the box counts a millionth inside it.
@@ -159,10 +175,54 @@ fn the_deepest_are_averaged_and_what_is_sunk_is_squared() {
 }
 
 #[test]
+fn every_group_has_its_own_deepest() {
+    let points = [
+        [0.5, 0.0, 0.0],
+        [-0.3, 0.0, 0.0],
+        [-0.05, 0.3, 0.0],
+        [0.1, 0.0, 0.4],
+    ];
+    let groups = [some(1, &[0, 3]), whole(1), some(9, &[2, 3])];
+    before_a_plane(&points, &groups, |touch| {
+        let touch = touch.unwrap();
+        let touched = touch.measure().unwrap();
+        let expected = [0.1, -0.3, 0.025];
+        assert!(
+            touched
+                .depths
+                .iter()
+                .zip(expected)
+                .all(|(a, b)| (a - b).abs() < 2e-6)
+        );
+        let found = touch.vjp(&touched, Some(&[1.0, 10.0, 4.0]), None).unwrap();
+        let along: Vec<f64> = found.points.iter().map(|v| v[0].round()).collect();
+        assert_eq!(along, [0.0, 10.0, 2.0, 3.0]);
+    });
+    // Without groups only what is sunk is left.
+    before_a_plane(&points, &[], |touch| {
+        let touched = touch.unwrap().measure().unwrap();
+        assert!(touched.depths.is_empty() && (touched.sunk[0] - 0.04).abs() < 1e-5);
+    });
+}
+
+#[test]
 fn what_does_not_fit_is_refused() {
-    before_a_plane(&[], 3, |touch| assert!(touch.unwrap_err().starts_with("points")));
-    before_a_plane(&[[0.0; 3]], 0, |touch| {
-        assert!(touch.unwrap_err().starts_with("points"))
+    let point = [[0.0; 3]];
+    for (points, group) in [
+        (&point[..0], whole(3)),
+        (&point, whole(0)),
+        (&point, some(1, &[])),
+        (&point, some(1, &[1])),
+        (&[[0.0; 3]; 3], some(1, &[1, 1])),
+        (&[[0.0; 3]; 3], some(1, &[2, 0])),
+    ] {
+        before_a_plane(points, &[group], |touch| {
+            assert!(touch.unwrap_err().starts_with("groups"))
+        });
+    }
+    let many = vec![whole(1); 33];
+    before_a_plane(&point, &many, |touch| {
+        assert!(touch.unwrap_err().starts_with("groups"))
     });
     let thin = Grid {
         size: [120, 1, 1],

@@ -1,6 +1,7 @@
 //! Distances from an object and what touches it: the Python face of `bigs_ops::distance` and `bigs_ops::touch`.
 
 use bigs_ops::distance::Grid;
+use bigs_ops::groups::Group;
 use bigs_ops::pose::Subject;
 use bigs_ops::touch::{Object, Touch, Touched};
 use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
@@ -71,12 +72,12 @@ const TOUCH: [&str; 8] = [
     "bounds",
 ];
 
-/// What else a call says: whether the hand is mirrored, how many vertices count, and the tolerance.
-type Options = (bool, usize, f64);
+/// What else a call says: whether the hand is mirrored, for each group how many of which vertices count, and the tolerance.
+type Options = (bool, Vec<(usize, Option<Vec<usize>>)>, f64);
 
 fn touch_of<'a, T: Kind>(
     [points, weights, bones, rotations, centers, scale, values, bounds]: &'a [PyReadonlyArrayDyn<'_, T>; 8],
-    (mirrored, deepest, tolerance): Options,
+    (mirrored, groups, tolerance): Options,
 ) -> PyResult<Touch<'a, T>> {
     let &[scale] = contiguous("scale", scale)? else {
         return Err(PyValueError::new_err("scale: expected one value"));
@@ -96,7 +97,11 @@ fn touch_of<'a, T: Kind>(
         centers: rows("centers", centers)?,
         scale,
     };
-    Touch::new(hand, object, deepest, T::of(tolerance)).map_err(value_error)
+    let groups: Vec<Group> = groups
+        .into_iter()
+        .map(|(deepest, vertices)| Group { deepest, vertices })
+        .collect();
+    Touch::new(hand, object, &groups, T::of(tolerance)).map_err(value_error)
 }
 
 fn touched<'py, T: Kind>(
@@ -115,11 +120,12 @@ fn touched<'py, T: Kind>(
     (depths, sunk, TouchState { kept: keep(found) }).into_pyobject(py)
 }
 
-/// Depths `[B]`, sums of squares `[B]` of what is sunk, and a state for the backward pass.
+/// Flat depths `[B, G]`, sums of squares `[B]` of what is sunk, and a state for the backward pass.
 ///
 /// `arrays` is (points `[V, 3]` or `[B, V, 3]`, weights `[V, K]`, bones `[B, K, 3 or 4, 4]`, rotations `[B, 3, 3]`, centers
 /// `[B, 3]`, scale `[]`, values `[Z, Y, X]`, bounds `[2, 3]`), C-contiguous, float32 or float64 throughout; `options` is
-/// whether the hand is mirrored, how many vertices count, and the tolerance. Raises ValueError.
+/// whether the hand is mirrored, for each of G groups how many of which vertices count (None for all), and the tolerance.
+/// Raises ValueError.
 #[pyfunction]
 pub(crate) fn touch_forward<'py>(
     py: Python<'py>,
