@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,13 +16,15 @@ from bigs.types import Side
 # Until grasps are known, this many consecutive frames count as one piece of evidence, since neighbours err
 # alike.
 _PIECE = 8
+# Number of choices of the evidence that are asked.
+_CHOICES = 200
 
 
 class FoundSize(NamedTuple):
     """The result of a search."""
 
     factor: float  # relative to the previous scale
-    # Standard error of the factor, from leaving out one grasp after the other; NaN for a single grasp.
+    # Standard error of the factor, by what other choices of the grasps would have said; NaN for a single one.
     spread: float
     factors: Tensor  # [C] tried
     costs: Tensor  # [C]
@@ -69,14 +71,12 @@ def search_object_scale(
     costs = _costs(gaps, touching) + hidden
     if not any(bool(t.any()) for t in touching.values()):
         return FoundSize(1.0, float("nan"), factors, costs)
-    best = _lowest(factors, costs)
-    without = [
-        _lowest(factors, _costs(gaps, touching | {side: touching[side] * ~piece}) + hidden)
-        for side in hands
-        for piece in _pieces(scene, side, touching[side])
-    ]
+    pieces = [(side, piece) for side in hands for piece in _pieces(scene, side, touching[side])]
+    best, spread = _lowest(factors, costs), float("nan")
+    if len(pieces) > 1:
+        best, spread = _agreed(_of_choices(factors, gaps, touching, pieces, hidden))
     scene.object_poses.log_scale.copy_(start + torch.tensor(best).log())
-    return FoundSize(best, _jackknife(without), factors, costs)
+    return FoundSize(best, spread, factors, costs)
 
 
 def _costs(gaps: dict[Side, Tensor], touching: dict[Side, Tensor]) -> Tensor:
@@ -104,10 +104,30 @@ def _pieces(scene: Scene, side: Side, touching: Tensor) -> list[Tensor]:
     return [piece for piece in pieces if piece.any()]
 
 
-def _jackknife(without: list[float]) -> float:
-    """The jackknife standard error of an estimate, from leaving out each piece of evidence."""
-    count = len(without)
-    if count < 2:
-        return float("nan")
-    found = torch.tensor(without)
-    return float(((count - 1) / count * (found - found.mean()).square().sum()).sqrt())
+def _of_choices(
+    factors: Tensor,
+    gaps: dict[Side, Tensor],
+    touching: dict[Side, Tensor],
+    pieces: Sequence[tuple[Side, Tensor]],
+    hidden: Tensor,
+) -> Tensor:
+    """The factors of least cost [R] for random choices of as many pieces of evidence, each any number of times."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randint(len(pieces), (_CHOICES, len(pieces)), generator=generator)
+    found = []
+    for choice in drawn:
+        times = torch.bincount(choice, minlength=len(pieces))
+        weights = {side: torch.zeros_like(touch) for side, touch in touching.items()}
+        for count, (side, piece) in zip(times.tolist(), pieces, strict=True):
+            weights[side] += count * piece * touching[side]
+        found.append(_lowest(factors, _costs(gaps, weights) + hidden))
+    return torch.tensor(found)
+
+
+def _agreed(found: Tensor) -> tuple[float, float]:
+    """The bootstrap's estimate and its standard error.
+
+    Under poor masks the cost has a wide floor with several minima, and which of them is the least hangs on one
+    grasp; the median of all choices does not. For the same reason no jackknife: it fails where a minimum jumps.
+    """
+    return float(found.median()), float(found.std())

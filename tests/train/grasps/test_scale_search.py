@@ -7,7 +7,7 @@ import torch
 from toy_scenes import CENTER, HALF, cube_scene
 
 from bigs.hand import HandModel
-from bigs.train.grasps.scale_search import search_object_scale
+from bigs.train.grasps.scale_search import _agreed, _costs, _lowest, _of_choices, search_object_scale
 from bigs.train.plan.config import ScaleSearchStage
 from bigs.types import Side
 
@@ -84,3 +84,21 @@ def test_grasps_that_disagree_make_the_size_uncertain(both_hands: dict[Side, Han
     one_sided = search_object_scale(cube_scene(both_hands, 0.95), STAGE, sure)
     assert abs(one_sided.factor - 1 / 0.95) <= GRID_STEP
     assert one_sided.text() == f"{one_sided.factor:.3f}", "one piece of evidence has no spread"
+
+
+def test_many_choices_err_less_than_one_where_grasps_scatter() -> None:
+    """Grasps each of whose size is off by 4 %: of their summed cost one grasp makes the least of many minima."""
+    generator = torch.Generator().manual_seed(3)
+    factors = torch.linspace(1.0 - STAGE.span, 1.0 + STAGE.span, STAGE.candidates)
+    of_frame = torch.arange(24) // 4
+    pieces = [("right", of_frame == g) for g in range(6)]
+    once, chosen = [], []
+    for _ in range(24):
+        own = 1.0 + 0.04 * torch.randn(6, generator=generator)
+        away = (factors[:, None] - own[of_frame]).abs()
+        gaps, sure = {"right": away / (away + 0.01)}, {"right": torch.ones(24)}
+        once.append(_lowest(factors, _costs(gaps, sure)) - 1.0)
+        factor, spread = _agreed(_of_choices(factors, gaps, sure, pieces, torch.zeros(len(factors))))
+        chosen.append(factor - 1.0)
+        assert 0.0 < spread < 0.06
+    assert torch.tensor(chosen).square().mean() < 0.7 * torch.tensor(once).square().mean()
