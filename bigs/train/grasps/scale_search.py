@@ -111,7 +111,7 @@ def _of_choices(
     pieces: Sequence[tuple[Side, Tensor]],
     hidden: Tensor,
 ) -> Tensor:
-    """The factors of least cost [R] for random choices of as many pieces of evidence, each any number of times."""
+    """The factors of least cost [R] for random choices of as many pieces, each any number of times."""
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(pieces), (_CHOICES, len(pieces)), generator=generator)
     found = []
@@ -127,7 +127,8 @@ def _of_choices(
 def _agreed(found: Tensor) -> tuple[float, float]:
     """The bootstrap's estimate and its standard error.
 
-    Under poor masks the cost has a wide floor with several minima, and which of them is the least hangs on one
-    grasp; the median of all choices does not. For the same reason no jackknife: it fails where a minimum jumps.
+    Under poor masks the cost has a wide floor with several minima, and which of them is the least hangs on
+    one grasp; the median of all choices does not. A jackknife would fail, since it needs a minimum that
+    moves evenly.
     """
     return float(found.median()), float(found.std())

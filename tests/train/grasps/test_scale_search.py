@@ -87,7 +87,7 @@ def test_grasps_that_disagree_make_the_size_uncertain(both_hands: dict[Side, Han
 
 
 def test_many_choices_err_less_than_one_where_grasps_scatter() -> None:
-    """Grasps each of whose size is off by 4 %: of their summed cost one grasp makes the least of many minima."""
+    """Where each grasp is off by 4 %, one of them decides which of the cost's minima is the least."""
     generator = torch.Generator().manual_seed(3)
     factors = torch.linspace(1.0 - STAGE.span, 1.0 + STAGE.span, STAGE.candidates)
     of_frame = torch.arange(24) // 4
