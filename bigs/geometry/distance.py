@@ -12,7 +12,7 @@ from bigs.fused.posing import Posing
 from bigs.fused.touch import Group, Touch
 from bigs.geometry.surface import DistanceGrid
 
-# What reaches furthest of a hand: a fingertip's worth of its vertices.
+# Of a whole hand so many vertices count: a fingertip's or two.
 WHOLE_HAND = Group(30)
 
 

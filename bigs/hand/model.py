@@ -109,7 +109,9 @@ class HandModel(nn.Module):
     def fingertips(self) -> tuple[tuple[int, ...], ...]:
         """Vertices that most follow the outermost segments of index, middle, pinky and ring."""
         leading = self.lbs_weights.argmax(dim=1)
-        return tuple(tuple((leading == joint).nonzero()[:, 0].tolist()) for joint in _OUTERMOST)
+        tips = (tuple((leading == joint).nonzero()[:, 0].tolist()) for joint in _OUTERMOST)
+        # A model may skin a finger without its outermost joint.
+        return tuple(tip for tip in tips if tip)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Vertices [..., V, 3] of the shape `betas` [..., 10] in the rest pose, metres."""

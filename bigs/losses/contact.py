@@ -49,7 +49,8 @@ def fingers_on_surface(depths: Tensor, holding: Tensor) -> Tensor:
         depths: [B, F] mean of the least signed distances of each fingertip's vertices, metres.
         holding: [B] in [0, 1], how sure it is that the hand holds the object.
     """
-    return (surface_gaps(depths).mean(dim=1) * holding).sum() / holding.sum().clamp_min(1.0)
+    fingers = max(depths.shape[1], 1)
+    return (surface_gaps(depths).sum(dim=1) * holding).sum() / (fingers * holding.sum().clamp_min(1.0))
 
 
 def penetration(sunk: Tensor) -> Tensor:

@@ -51,6 +51,7 @@ def test_each_finger_is_drawn_by_itself_while_the_hand_holds() -> None:
     (far,) = torch.autograd.grad(fingers_on_surface(fingers, torch.tensor([0.0, 0.5])), fingers)
     assert 0 < far[1, 1] < 0.02 * pull[0, 1] and far[1, 0] < 0
     assert fingers_on_surface(fingers, torch.zeros(2)) == 0.0
+    assert fingers_on_surface(fingers[:, :0], holding) == 0.0
 
 
 def test_penetration_is_in_squared_centimetres() -> None:

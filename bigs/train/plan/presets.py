@@ -33,6 +33,9 @@ _POSE_PRIORS = {
 # joint does not have (4 degrees, since a model's axes are not exactly a hand's) usually are.
 _GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5, "joint_axes": 60.0}
 
+# Hands that touch the object lie on its surface, and so do the fingers of a grasp; nothing lies inside.
+_TOUCH = {"contact": 0.1, "finger_contact": 0.1, "penetration": 0.01}
+
 # Of stages that look at the whole clip in every step.
 _SETTLED = 10
 _HANDS_COARSE = OptimizeStage(
@@ -95,7 +98,7 @@ _CONTACT = OptimizeStage(
     step="interacting-subjects",
     steps=50,
     lrs=_GRASPED_RATES,
-    weights={"silhouette": 1.0, **_GRASP_PRIORS, "contact": 0.1, "finger_contact": 0.1, "penetration": 0.01},
+    weights={"silhouette": 1.0, **_GRASP_PRIORS, **_TOUCH},
     image_size=160,
     stop_patience=_SETTLED,
 )
@@ -144,9 +147,7 @@ _PLAUSIBLE_TOGETHER = {
     "joint_axes": 2.4,
     "depth_prior": 12.0,
     "rigid": 0.03,
-    "contact": 0.1,
-    "finger_contact": 0.1,
-    "penetration": 0.01,
+    **_TOUCH,
     "object_acceleration": 0.005,
     "object_prior": 0.1,
 }
