@@ -134,11 +134,13 @@ def finger_contact(step: Step) -> Tensor:
     if not step.has_object:
         return torch.zeros(())
     grasps = step.scene.grasps
-    return mean_of(
+    # Hands that hold nothing say 0.
+    each = [
         fingers_on_surface(touch.depths[:, 1:], grasps[side].certainty)
         for side, touch in step.touches.items()
-        if grasps[side].count
-    )
+    ]
+    holding = sum(bool(grasps[side].count) for side in step.touches)
+    return mean_of(each) * (len(each) / max(holding, 1))
 
 
 def penetrating(step: Step) -> Tensor:

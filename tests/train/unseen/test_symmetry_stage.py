@@ -93,12 +93,14 @@ def test_the_shape_gains_and_nothing_that_was_seen_changes(
     assert not any(parameter.requires_grad for parameter in completed[0].parameters())
 
 
-def test_hands_meet_what_they_meet_without_it(
+def test_hands_meet_the_surface_that_is_completed_later(
     plain: tuple[Scene, FitReport], completed: tuple[Scene, FitReport]
 ) -> None:
-    """Or poses would depend on a symmetry, and in all but the frames' own errors some would get worse."""
+    """A hull of few directions is deep: what hands hold of an object that hardly turned lies inside it."""
     assert completed[1].facts["object completed"]
-    assert torch.equal(plain[0].object_distance.values, completed[0].object_distance.values)
+    verts = completed[0].object_surface.verts
+    off, hull_off = (scene.object_distance(verts).abs().mean() for scene in (completed[0], plain[0]))
+    assert off < 1e-3 and hull_off > 2.0 * off
 
 
 def test_what_is_added_shows_in_no_frame(
