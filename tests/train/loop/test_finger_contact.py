@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 
@@ -73,3 +75,10 @@ def test_fingertips_are_the_outermost_segments(both_hands: dict[Side, HandModel]
             assert int(hand.tip_vertex_ids[tip]) in segment
             length = (template[hand.tip_vertex_ids[tip]] - joints[outer]).norm()
             assert ((template[list(segment)] - joints[outer]).norm(dim=1) < 1.3 * length).all()
+
+
+def test_a_finger_that_no_vertex_follows_has_no_tip(both_hands: dict[Side, HandModel]) -> None:
+    stiff = copy.deepcopy(both_hands["right"])
+    stiff.__dict__.pop("fingertips", None)
+    stiff.lbs_weights[:, 6] = 0.0
+    assert stiff.fingertips == tuple(both_hands["right"].fingertips[i] for i in (0, 2, 3))
