@@ -32,6 +32,9 @@ _FIELD_RATES = {
     "object.geometry": 1e-3,
 }
 
+# Terms that fields have nothing for.
+_TERMS_OF_FREE_GAUSSIANS = ("color_prior", "thickness")
+
 
 @dataclass(frozen=True)
 class Switch:
@@ -142,7 +145,9 @@ def _keep_fields(config: RunConfig) -> RunConfig:
             return stage
         subjects = {group.split(".")[0] for group in free & set(stage.lrs)}
         fields = {name: rate for name, rate in _FIELD_RATES.items() if name.split(".")[0] in subjects}
-        return replace(stage, lrs=_less(stage.lrs, free) | fields)
+        return replace(
+            stage, lrs=_less(stage.lrs, free) | fields, weights=_less(stage.weights, _TERMS_OF_FREE_GAUSSIANS)
+        )
 
     before, after = config.stages[: splits[0]], config.stages[splits[0] :]
     return _keep(replace(config, stages=(*before, *map(with_fields, after))), leave_out=SplitStage)

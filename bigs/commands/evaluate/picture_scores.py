@@ -13,7 +13,11 @@ from bigs.data.base import Clip
 from bigs.data.novel import load_novel_views
 from bigs.metrics.picture import ALIGNED, NOVEL, NOVEL_SCALED, Distance, aligned_psnr, picture_scores
 from bigs.models.playback import Playback
+from bigs.threads import side_by_side
 from bigs.types import MASK_VALUES
+
+# Frames that are rendered and compared at once, at most.
+_AT_ONCE = 4
 
 
 def frame_scores(
@@ -30,10 +34,14 @@ def frame_scores(
         distance: see `picture_scores`.
         at: [T] the playback's frames that show the clip's; None takes all in their order.
     """
-    rows = []
-    for t, frame in enumerate(range(len(clip)) if at is None else at):
-        color, _ = render_input_view(playback, int(frame))
-        rows.append(picture_scores(color, clip.image(t) / 255.0, clip.mask(t) != 0, distance))
+    frames = range(len(clip)) if at is None else at
+
+    def scores(t: int) -> dict[str, float]:
+        color, _ = render_input_view(playback, int(frames[t]))
+        return picture_scores(color, clip.image(t) / 255.0, clip.mask(t) != 0, distance)
+
+    # A frame alone is too small to keep several threads at work, and more frames at once take memory.
+    rows = side_by_side(scores, range(len(frames)), min(torch.get_num_threads(), _AT_ONCE))
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 

@@ -15,6 +15,7 @@ from bigs.guidance.schedule import SdsConfig
 from bigs.guidance.sds import sds_loss
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.weighted import mean_of
+from bigs.models.object_detail import ObjectDetail
 from bigs.train.loop import image_terms, pose_terms
 from bigs.train.loop.step import Step
 from bigs.train.loop.virtual_views import object_orbit, render_object
@@ -52,6 +53,27 @@ def offset(step: Step) -> Tensor:
         if "object" in step.canonical
         else torch.zeros(())
     )
+
+
+def color_prior(step: Step) -> Tensor:
+    """Squared change of the colours of the object's free Gaussians from what their field said, in logits.
+
+    Adam takes steps of one size, however little the pictures say. This holds what they hardly show, and is
+    nothing against what they show well.
+    """
+    splats = step.scene.object_splats
+    return squared_norm(splats.color) if isinstance(splats, ObjectDetail) else torch.zeros(())
+
+
+def thickness(step: Step) -> Tensor:
+    """Squared growth of the object's free Gaussians across the surface, logarithmic.
+
+    On outlines they would grow into spikes, which stand out where the camera sees them from aside.
+    """
+    splats = step.scene.object_splats
+    if not isinstance(splats, ObjectDetail):
+        return torch.zeros(())
+    return squared_norm(splats.size[:, 2:].clamp_min(0.0))
 
 
 def sds(step: Step) -> Tensor:
@@ -122,7 +144,15 @@ IMAGE_TERMS: dict[str, dict[str, Term]] = {
 
 # Terms of the canonical subjects and of the poses.
 TERMS: dict[str, Term] = {
-    **_of_gaussians(color=color, scale=scale, lbs=lbs, offset=offset, sds=sds),
+    **_of_gaussians(
+        color=color,
+        scale=scale,
+        lbs=lbs,
+        offset=offset,
+        color_prior=color_prior,
+        thickness=thickness,
+        sds=sds,
+    ),
     **_of_poses(
         silhouette=pose_terms.silhouette,  # by Gaussians of its own
         smooth=pose_terms.smooth,

@@ -139,6 +139,8 @@ _REGRASP = OptimizeStage(
 _PLAUSIBLE_TOGETHER = {
     "scale": 100.0,
     "offset": 0.02,
+    "color_prior": 0.05,
+    "thickness": 0.5,
     "shade_prior": 0.01,
     **_POSE_PRIORS,
     # Colours now say what these priors had to say before.
