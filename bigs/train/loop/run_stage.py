@@ -158,7 +158,9 @@ def run_stage(
         loss = weighted_sum(values, stage.weights) if problem is None else None
         if loss is not None:
             optimizer.zero_grad()
-            loss.backward()
+            # There is none where no term has anything to look at, such as those of free Gaussians in a field.
+            if loss.requires_grad:
+                loss.backward()
             if stage.free_frames:
                 _spare_grasps(scene)
             problem = _unbounded_gradient(scene)
