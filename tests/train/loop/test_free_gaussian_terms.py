@@ -26,11 +26,12 @@ def detail(scene: Scene) -> ObjectDetail:
     return scene.object_splats
 
 
-def test_fields_and_fresh_gaussians_cost_nothing(scene: Scene, evidence: Evidence) -> None:
+def test_a_field_costs_nothing(scene: Scene, evidence: Evidence) -> None:
     assert loss("color_prior", scene, evidence) == loss("thickness", scene, evidence) == 0.0
-    with torch.no_grad():
-        whole = scene.object_splats()
-    scene.object_splats = split_object(whole, 1, 0.0)
+
+
+@pytest.mark.usefixtures("detail")
+def test_fresh_gaussians_cost_nothing(scene: Scene, evidence: Evidence) -> None:
     assert loss("color_prior", scene, evidence) == loss("thickness", scene, evidence) == 0.0
 
 
