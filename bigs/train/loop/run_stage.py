@@ -158,7 +158,7 @@ def run_stage(
         loss = weighted_sum(values, stage.weights) if problem is None else None
         if loss is not None:
             optimizer.zero_grad()
-            # No gradient where no term has anything to look at, such as those of free Gaussians beside fields.
+            # No gradient where no term has anything to look at, as those of free Gaussians beside fields.
             if loss.requires_grad:
                 loss.backward()
             if stage.free_frames:
