@@ -18,6 +18,7 @@ __all__ = [
     "default_settings",
     "distances",
     "fma_peak_gflops",
+    "form_factors",
     "hand_poses_backward",
     "hand_poses_forward",
     "harmonics_backward",
@@ -122,11 +123,14 @@ def harmonics_backward(
     """Flat gradients of dirs and coeffs; what is not wanted is an empty array."""
 
 # Of a subject: points [N, 3] or [B, N, 3], weights [N, K], bones [B, K, 3 or 4, 4], quats [N, 4] or None,
-# albedo [N, 3] or None, parts [N, J] or None, shade [B, 4 + J] or None, whether it is mirrored.
+# albedo [N, 3] or None, parts [N, J] or None, shade [B, 4 + J] or None, occlusion [B, N] or None,
+# ambient [3] or None, whether it is mirrored.
 _Posing = tuple[
     NDArray[Any],
     NDArray[Any],
     NDArray[Any],
+    NDArray[Any] | None,
+    NDArray[Any] | None,
     NDArray[Any] | None,
     NDArray[Any] | None,
     NDArray[Any] | None,
@@ -147,9 +151,15 @@ def pose_backward(
     pulls: list[NDArray[Any] | None],
     wanted: list[list[bool]],
 ) -> tuple[list[tuple[NDArray[Any], ...]], NDArray[Any]]:
-    """Flat gradients of each subject's points, weights, bones, quats, albedo and shade, and of clip.
+    """Flat gradients of each subject's points, weights, bones, quats, albedo, shade and ambient, and of clip.
 
     `pulls` are those of means, quats and colours; what is not wanted is an empty array.
+    """
+
+def form_factors(arrays: tuple[NDArray[Any], ...]) -> NDArray[Any]:
+    """Flat sums of form factors at places in B frames.
+
+    `arrays` are points and normals [B, N, 3], those of the discs [B, M, 3], and their areas [M].
     """
 
 def terms_together(

@@ -44,6 +44,8 @@ def posed(subject: Posing, clip: Tensor | None) -> tuple[Tensor, Tensor, Tensor]
         normals = third_axis(quats)
         shaded = subject.shade[:, None, :1] + normals @ subject.shade[:, 1:4, None]
         shaded = shaded + subject.parts @ subject.shade[:, 4:, None]
+        if subject.occlusion is not None:
+            shaded = shaded + subject.occlusion[..., None] * subject.ambient
         colors = colors * torch.exp(quadratic_basis(normals) @ clip + shaded)
     return means, quats, colors
 

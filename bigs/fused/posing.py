@@ -23,6 +23,9 @@ class Posing(NamedTuple):
     albedo: Tensor | None = None  # [N, 3]
     parts: Tensor | None = None  # [N, J] how far each belongs to the parts of a subject; no gradient
     shade: Tensor | None = None  # [B, 4 + J]; without light there are neither parts nor shade
+    # [B, N] share of the sky that surfaces nearby cover (see `bigs.fused.occlusion`); no gradient
+    occlusion: Tensor | None = None
+    ambient: Tensor | None = None  # [3] logarithm of a colour's factor under a sky that is covered altogether
     mirrored: bool = False
 
 
@@ -36,7 +39,8 @@ def pose(subjects: Sequence[Posing], clip: Tensor | None, labels: bool) -> tuple
     Centres follow the blended transforms, orientations the blended quaternions of the bones' rotations, signs
     aligned with the first bone's; a mirrored subject shows what the plane x = 0 mirrors. Colours are albedos
     times exp of a quadratic function of the outward normal, the Gaussian's third axis, for the clip, and of a
-    linear one with a constant for each part for every frame (see `bigs.models.lighting`).
+    linear one with a constant for each part for every frame, and times exp of occlusion times ambient (see
+    `bigs.models.lighting`).
 
     Args:
         subjects: of the same B frames and dtype; all with quats and albedo.
@@ -53,7 +57,7 @@ def pose(subjects: Sequence[Posing], clip: Tensor | None, labels: bool) -> tuple
 
 def skin(subject: Posing) -> Tensor:
     """The centres [B, N, 3] alone of a subject; only points, weights and bones count."""
-    bare = subject._replace(quats=None, albedo=None, parts=None, shade=None)
+    bare = Posing(*subject[:3], mirrored=subject.mirrored)
     return _Pose.apply((bare.mirrored,), False, None, *bare[:_TENSORS])[0]
 
 
@@ -81,14 +85,17 @@ class _Pose(torch.autograd.Function):
     def backward(ctx: Any, *pulls: Tensor | None) -> tuple:
         clip, *tensors = ctx.saved_tensors
         wants_clip, *wants = ctx.needs_input_grad[2:]
-        # Points, weights, bones, quats, albedo, and shade, with which the clip's light comes; not parts.
-        wanted = [[*wants[at : at + 5], wants[at + 6] or wants_clip] for at in range(0, len(wants), _TENSORS)]
+        # Points, weights, bones, quats, albedo, and all of the light together; not parts and occlusion.
+        wanted = [
+            [*wants[at : at + 5], wants[at + 6] or wants[at + 8] or wants_clip]
+            for at in range(0, len(wants), _TENSORS)
+        ]
         frames, subjects = _called(ctx.mirrored, tensors)
         given = [array_or_none(pull) for pull in pulls]
         found, v_clip = _raster.pose_backward(
             frames, subjects, array_or_none(clip), ctx.labels, given, wanted
         )
-        gradients = [value for own in found for value in (*own[:5], None, own[5])]
+        gradients = [value for own in found for value in (*own[:5], None, own[5], None, own[6])]
         return (
             None,
             None,

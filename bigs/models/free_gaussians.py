@@ -15,7 +15,7 @@ class FreeGaussians(nn.Module):
     than the rendering. Optimisation goes on with a displacement, size, opacity and colour for each Gaussian.
     """
 
-    base_means: Tensor
+    base_points: Tensor
     base_quats: Tensor
     base_log_scales: Tensor
     opacity_logits: Tensor
@@ -26,7 +26,7 @@ class FreeGaussians(nn.Module):
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; `start` fills it."""
         super().__init__()
-        self.register_buffer("base_means", torch.zeros(count, 3))
+        self.register_buffer("base_points", torch.zeros(count, 3))
         self.register_buffer("base_quats", torch.zeros(count, 4))
         self.register_buffer("base_log_scales", torch.zeros(count, 3))
         self.register_buffer("opacity_logits", torch.zeros(count))
@@ -44,7 +44,7 @@ class FreeGaussians(nn.Module):
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, normals: Tensor
     ) -> None:
         """Begin from N Gaussians as `types.Gaussians` has them, and their unit normals [N, 3]."""
-        self.base_means.copy_(means)
+        self.base_points.copy_(means)
         self.base_quats.copy_(quats)
         self.base_log_scales.copy_(scales.log())
         self.opacity_logits.copy_(torch.logit(opacities.clamp(_LEAST_OPACITY, _MOST_OPACITY)))
@@ -55,7 +55,7 @@ class FreeGaussians(nn.Module):
     def release(self, chosen: Tensor) -> None:
         """Let those `chosen` [N] (bool) change as much as any from now on; they stay as they are."""
         free = (self.freedom * chosen)[:, None]
-        self.base_means += free * self.shift[:, None] * self.normals
+        self.base_points += free * self.shift[:, None] * self.normals
         self.base_log_scales += free * self.size
         self.opacity_logits += free[:, 0] * self.opacity
         self.color_logits += free * self.color

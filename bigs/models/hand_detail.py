@@ -34,7 +34,7 @@ class HandDetail(FreeGaussians):
     def forward(self) -> CanonicalHand:
         """The Gaussians as their parameters are now."""
         return CanonicalHand(
-            self.base_means + self.offsets,
+            self.base_points + self.offsets,
             self.shapedirs,
             self.posedirs,
             self.base_weights,

@@ -29,7 +29,7 @@ class ObjectDetail(FreeGaussians):
         """The Gaussians as their parameters are now."""
         offsets = self.offsets
         return CanonicalObject(
-            self.base_means + offsets,
+            self.base_points + offsets,
             offsets,
             self.base_quats,
             self.scales,

@@ -16,20 +16,20 @@ from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import mirror_axis_angle, mirror_points
 from bigs.hand.lbs import pose_corrective
 from bigs.models.canonical import CanonicalHand, CanonicalObject
-from bigs.models.lighting import Lighting
+from bigs.models.lighting import LEVELS, Lighting
 from bigs.models.poses import ObjectFrames
-from bigs.models.posing import Part, hand_part, object_part, pose_parts
+from bigs.models.posing import Covered, Part, hand_part, object_part, pose_parts
 from bigs.models.scene import Scene
 from bigs.names import check_name
 from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
 
 # Fields with a value per frame.
 _MOVING_HAND = (
-    *("joints", "verts", "bones", "hand_pose", "shade"),
+    *("joints", "verts", "bones", "hand_pose", "shade", "occlusion"),
     *("global_orient_aa", "hand_pose_aa", "transl"),
     *("grasp", "grasp_certainty"),
 )
-_MOVING_OBJECT = ("rotations", "centers", "shade")
+_MOVING_OBJECT = ("rotations", "centers", "shade", "occlusion")
 
 
 class Grasp(NamedTuple):
@@ -51,6 +51,8 @@ class HandPlayback:
     hand_pose: Tensor  # [T, 15, 3, 3] finger rotations of the canonical hand
     splats: CanonicalHand  # points already in the clip's shape
     shade: Tensor  # [T, 4 + 16] see `lighting`
+    occlusion: Tensor  # [T, N] uint8: share of the sky in parts of `LEVELS`, see `lighting`
+    ambient: Tensor  # [3] see `lighting`
     # The same poses in that side's own MANO convention, x_cam = MANO(orient, pose, betas) + transl
     # about the rest wrist joint; a left hand's model is the mirrored right one.
     global_orient_aa: Tensor  # [T, 3]
@@ -87,6 +89,8 @@ class ObjectPlayback:
     faces: Tensor  # [F, 3]
     splats: CanonicalObject
     shade: Tensor  # [T, 4 + 16]
+    occlusion: Tensor  # [T, N] uint8
+    ambient: Tensor  # [3]
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,10 @@ class Playback:
             if subject.splats.posedirs is not None:
                 points = points + pose_corrective(subject.splats.posedirs, subject.hand_pose[index])
             part = hand_part(subject.splats, points, subject.bones[index], entity)
-        return part if self.light is None else part.lit(subject.splats.weights, subject.shade[index])
+        if self.light is None:
+            return part
+        covered = Covered(subject.occlusion[index].to(subject.ambient) / LEVELS, subject.ambient)
+        return part.lit(subject.splats.weights, subject.shade[index], covered)
 
     def trajectory(self) -> HandObjectTrajectory:
         """Meshes and joints of every frame, camera space, metres."""
@@ -213,6 +220,11 @@ def record(
     hands: dict[Side, HandPlayback] = {}
     lighting = Lighting(scene.entities, scene.n_frames) if scene.lighting is None else scene.lighting
     shade = {entity: value.detach().clone() for entity, value in lighting.shade.items()}
+    ambient = {entity: value.detach().clone() for entity, value in lighting.ambient.items()}
+    covered = {
+        entity: lighting.occlusion[entity].at(scene.splats(entity).base_points) for entity in scene.entities
+    }
+    occlusion = {entity: (LEVELS * shares).round().to(torch.uint8) for entity, shares in covered.items()}
     for side in scene.sides:
         model, betas = scene.hand_model(side), scene.hand_betas(side)
         pose = scene.at(frames).canonical_hand(side)
@@ -236,6 +248,8 @@ def record(
                 points=splats.points + splats.shapedirs @ betas, shapedirs=splats.shapedirs[..., :0]
             ),
             shade[side],
+            occlusion[side],
+            ambient[side],
             orient,
             fingers,
             transl,
@@ -259,6 +273,8 @@ def record(
             surface.faces,
             canonical["object"],
             shade["object"],
+            occlusion["object"],
+            ambient["object"],
         )
     return Playback(
         name,

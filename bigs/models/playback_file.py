@@ -31,9 +31,9 @@ from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
 from bigs.names import check_name
 from bigs.types import SIDES, Side
 
-FORMAT = "bigs-scene-4"
-# The previous format, without a checksum and grasps.
-_UNSUMMED = "bigs-scene-3"
+FORMAT = "bigs-scene-5"
+# The format before, without occlusion, and the one before that, without a checksum and grasps as well.
+_UNCOVERED, _UNSUMMED = "bigs-scene-4", "bigs-scene-3"
 # No camera has more pixels on a side.
 _MOST_PIXELS = 1 << 16
 
@@ -70,7 +70,7 @@ def save_playback(path: Path, playback: Playback) -> None:
 
 
 def load_playback(path: Path) -> Playback:
-    """Read what `save_playback` wrote, or an earlier version did without a checksum.
+    """Read what `save_playback` wrote, or two earlier versions did.
 
     Raises:
         InputError: missing, damaged, of another format, or with a part that does not fit.
@@ -85,7 +85,7 @@ def load_playback(path: Path) -> Playback:
     facts = parse_json(f"{path}: metadata", text)
     if not isinstance(facts, dict):
         raise InputError(f"{path}: metadata: expected a dictionary, found {shown(facts)}")
-    if facts.get("format") not in (FORMAT, _UNSUMMED):
+    if facts.get("format") not in (FORMAT, _UNCOVERED, _UNSUMMED):
         raise InputError(f"{path}: expected format {FORMAT}, found {shown(facts.get('format'))}")
     stored = facts.pop("checksum", None)
     expected = None if facts["format"] == _UNSUMMED else checksum(json.dumps(facts), tensors)
@@ -96,6 +96,8 @@ def load_playback(path: Path) -> Playback:
         )
     if facts["format"] == _UNSUMMED:
         tensors |= _without_grasps(tensors)
+    if facts["format"] != FORMAT:
+        tensors |= _without_occlusion(tensors)
     _check(str(path), facts, tensors)
     return _assemble(facts, tensors)
 
@@ -108,6 +110,17 @@ def _without_grasps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if joints is not None and joints.ndim:
             found[f"{side}.grasp"] = torch.full((len(joints),), -1)
             found[f"{side}.grasp_certainty"] = torch.zeros(len(joints))
+    return found
+
+
+def _without_occlusion(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What stands for occlusion that a file of an earlier version lacks: nothing covers anything."""
+    found: dict[str, Tensor] = {}
+    for entity, splats in (("right", "points"), ("left", "points"), ("object", "means")):
+        shade, points = (tensors.get(f"{entity}.{name}") for name in ("shade", f"splats.{splats}"))
+        if shade is not None and points is not None and shade.ndim and points.ndim:
+            found[f"{entity}.occlusion"] = torch.zeros(len(shade), len(points), dtype=torch.uint8)
+            found[f"{entity}.ambient"] = torch.zeros(3)
     return found
 
 
@@ -129,12 +142,15 @@ def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) 
         if name not in tensors:
             raise InputError(f"{where}: expected a tensor {name}, found none")
         check_shape(f"{where}: {name}", tensors[name], shape)
-        whole = name.endswith(("faces", "tip_vertex_ids", ".grasp"))
-        if tensors[name].dtype != (torch.int64 if whole else torch.float32):
-            raise InputError(
-                f"{where}: {name}: expected {'int64' if whole else 'float32'}, found {tensors[name].dtype}"
-            )
-        if not whole:
+        dtype = torch.float32
+        if name.endswith(("faces", "tip_vertex_ids", ".grasp")):
+            dtype = torch.int64
+        elif name.endswith(".occlusion"):
+            dtype = torch.uint8
+        if tensors[name].dtype != dtype:
+            expected, found = (str(kind).removeprefix("torch.") for kind in (dtype, tensors[name].dtype))
+            raise InputError(f"{where}: {name}: expected {expected}, found {found}")
+        if dtype == torch.float32:
             check_finite(f"{where}: {name}", tensors[name])
     for name in [name for name in shapes if name.endswith(".faces")]:
         check_faces(f"{where}: {name}", tensors[name], tensors[name.replace("faces", "verts")].shape[-2])
@@ -185,6 +201,8 @@ def _hand_shapes(side: Side, frames: int, tensors: Mapping[str, Tensor]) -> dict
         "bones": (frames, 16, 4, 4),
         "hand_pose": (frames, 15, 3, 3),
         "shade": (frames, 20),
+        "occlusion": (frames, count),
+        "ambient": (3,),
         "global_orient_aa": (frames, 3),
         "hand_pose_aa": (frames, 15, 3),
         "transl": (frames, 3),
@@ -218,6 +236,8 @@ def _object_shapes(frames: int, tensors: Mapping[str, Tensor]) -> dict[str, Shap
         "verts": ("V", 3),
         "faces": ("F", 3),
         "shade": (frames, 20),
+        "occlusion": (frames, count),
+        "ambient": (3,),
         "splats.means": ("N", 3),
         "splats.offsets": (count, 3),
         "splats.quats": (count, 4),

@@ -16,7 +16,7 @@ from bigs.hand import Skeleton, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.hand_splats import pose_splats, rest_points
 from bigs.models.poses import HandFrames, ObjectFrames
-from bigs.models.posing import Part, hand_part, object_part, pose_parts
+from bigs.models.posing import Covered, Part, hand_part, object_part, pose_parts
 from bigs.types import Entity, Gaussians, Side
 
 if TYPE_CHECKING:
@@ -124,7 +124,9 @@ class PosedScene:
         lighting = self._scene.lighting
         if lighting is None:
             return part
-        return part.lit(canonical.weights, lighting.shade[entity][self.frames])
+        resting = self._scene.splats(entity).base_points
+        covered = Covered(lighting.occlusion[entity].at(resting)[self.frames], lighting.ambient[entity])
+        return part.lit(canonical.weights, lighting.shade[entity][self.frames], covered)
 
     def _own_hand(self, side: Side) -> HandFrames:
         poses, grasps = self._scene.hand_poses[side], self._scene.grasps[side]

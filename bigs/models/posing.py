@@ -14,6 +14,13 @@ from bigs.models.poses import ObjectFrames
 from bigs.types import Gaussians, Side
 
 
+class Covered(NamedTuple):
+    """What surfaces nearby take of a subject's light; see `lighting`."""
+
+    occlusion: Tensor  # [B, N] in [0, 1]
+    ambient: Tensor  # [3]
+
+
 class Part(NamedTuple):
     """One subject's N Gaussians in B frames."""
 
@@ -21,10 +28,13 @@ class Part(NamedTuple):
     scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
 
-    def lit(self, parts: Tensor, shade: Tensor) -> Part:
+    def lit(self, parts: Tensor, shade: Tensor, covered: Covered | None = None) -> Part:
         """With the shade [B, 4 + J] of its frames; parts [N, J] as in `lighting`."""
         # Light does not change how a hand bends.
-        return self._replace(posing=self.posing._replace(parts=parts.detach(), shade=shade))
+        posing = self.posing._replace(parts=parts.detach(), shade=shade)
+        if covered is not None:
+            posing = posing._replace(occlusion=covered.occlusion, ambient=covered.ambient)
+        return self._replace(posing=posing)
 
 
 def hand_part(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) -> Part:

@@ -132,6 +132,10 @@ class Scene(nn.Module):
         """The shape [10] of a side, which both sides share where they share the hand."""
         return self.betas[self.canonical_side(side)]
 
+    def splats(self, entity: Entity) -> HandSplats | HandDetail | ObjectSplats | ObjectDetail:
+        """The Gaussians of a subject that there is, in its own space; a hand's may be both sides'."""
+        return self.object_splats if entity == "object" else self.hand_splats[self.canonical_side(entity)]
+
     def canonical(self, entities: Iterable[Entity]) -> dict[Entity, CanonicalHand | CanonicalObject]:
         """Evaluate the fields of `entities`, each field once."""
         evaluated: dict[Entity, CanonicalHand] = {}

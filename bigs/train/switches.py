@@ -241,9 +241,10 @@ _INGREDIENTS = {
         _all_of(
             lambda config: replace(config, lighting=False),
             _terms("shade_prior"),
-            _groups("scene.light", "scene.shade"),
+            _groups("scene.light", "scene.shade", "scene.ambient"),
         ),
     ),
+    "ambient": Switch("ambient occlusion: shade of surfaces by each other", _groups("scene.ambient")),
     "labels": Switch(
         "the label term (who hides whom), also in the search of the object's size",
         _all_of(_terms("labels"), _search_labels),

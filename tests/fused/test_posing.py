@@ -14,7 +14,15 @@ B = 3
 
 
 def random_subject(
-    seed: int, count: int, bones: int, *, moving: bool, lit: bool, mirrored: bool, dtype=torch.float64
+    seed: int,
+    count: int,
+    bones: int,
+    *,
+    moving: bool,
+    lit: bool,
+    mirrored: bool,
+    covered: bool = True,
+    dtype=torch.float64,
 ) -> Posing:
     generator = torch.Generator().manual_seed(seed)
 
@@ -32,8 +40,12 @@ def random_subject(
         random(count, 3).sigmoid(),
         random(count, 3).softmax(-1) if lit else None,
         0.3 * random(B, 7) if lit else None,
+        random(B, count).sigmoid() if lit and covered else None,
+        0.5 * random(3) if lit and covered else None,
     )
-    tensors = (None if t is None else t.to(dtype).requires_grad_(i != 5) for i, t in enumerate(tensors))
+    tensors = (
+        None if t is None else t.to(dtype).requires_grad_(i not in (5, 7)) for i, t in enumerate(tensors)
+    )
     return Posing(*tensors, mirrored=mirrored)
 
 
@@ -47,7 +59,7 @@ def scene(lit: bool, dtype=torch.float64, count: int = 130) -> list[Posing]:
     return [
         random_subject(1, count, 16, moving=True, lit=lit, mirrored=True, dtype=dtype),
         random_subject(2, count + 7, 1, moving=False, lit=lit, mirrored=False, dtype=dtype),
-        random_subject(3, 5, 3, moving=False, lit=lit, mirrored=True, dtype=dtype),
+        random_subject(3, 5, 3, moving=False, lit=lit, mirrored=True, covered=False, dtype=dtype),
     ]
 
 
@@ -86,7 +98,7 @@ def test_gradients_are_finite_differences() -> None:
     tensors = [t for s in subjects for t in s[:-1]]
 
     def posed(clip: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return pose([Posing(*tensors[:7], mirrored=True), Posing(*tensors[7:])], clip, True)
+        return pose([Posing(*tensors[:9], mirrored=True), Posing(*tensors[9:])], clip, True)
 
     assert torch.autograd.gradcheck(posed, (random_clip(), *tensors))
 
@@ -110,7 +122,8 @@ def test_only_what_is_asked_for_gets_a_gradient() -> None:
     (wanted,) = torch.autograd.grad(pose([subject], random_clip(), False)[2].sum(), subject.albedo)
     pose([only], random_clip().detach(), False)[2].sum().backward()
     assert torch.equal(only.albedo.grad, wanted)
-    assert all(t.grad is None for t in (only.points, only.weights, only.bones, only.quats, only.shade))
+    others = (only.points, only.weights, only.bones, only.quats, only.shade, only.ambient)
+    assert all(t.grad is None for t in others)
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -119,6 +132,8 @@ def test_what_does_not_fit_is_refused() -> None:
         subject._replace(points=subject.points[:5]),
         subject._replace(quats=subject.quats[:5]),
         subject._replace(shade=subject.shade[:, :5]),
+        subject._replace(occlusion=subject.occlusion[:, :5].contiguous()),
+        subject._replace(ambient=subject.ambient[:2].contiguous()),
         subject._replace(bones=subject.bones[:, :2]),
     ):
         with pytest.raises(ValueError, match="expected"):

@@ -18,6 +18,7 @@ from bigs.hand import HandModel, builtin_hand
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.lighting import Lighting
 from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
+from bigs.models.occlusion import measure_occlusion
 from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import ObjectSurface, Scene
 from bigs.types import Gaussians
@@ -119,4 +120,6 @@ def make_scene(
         **(parts if with_object else dict.fromkeys(parts)),
     )
     disturb(scene, 0.1, seed=seed + 1)
+    if lighting:
+        measure_occlusion(scene)
     return scene

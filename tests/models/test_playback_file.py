@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +71,23 @@ def test_a_scene_of_before_there_was_a_checksum(whole: Path, tmp_path: Path) -> 
     path = tmp_path / "scene.safetensors"
     save_file(tensors, path, {"bigs": json.dumps(facts | {"format": "bigs-scene-3"})})
     assert len(load_playback(path)) == 4
-    save_file(tensors, path, {"bigs": json.dumps(facts)})
+    save_file(tensors, path, {"bigs": json.dumps(facts | {"format": "bigs-scene-5"})})
     with pytest.raises(InputError, match=r"checksum .* found None: .* --resume"):
         load_playback(path)
+
+
+def test_a_scene_of_before_there_was_occlusion(whole: Path, forge: Callable[..., Path]) -> None:
+    """It looks as it did: nothing covers anything."""
+    playback = load_playback(whole)
+    subjects = (*playback.hands, "object")
+    assert playback.object.occlusion.any()
+    gone = {f"{name}.{field}": None for name in subjects for field in ("occlusion", "ambient")}
+    found = load_playback(forge({"format": "bigs-scene-4"}, gone))
+    assert not found.object.occlusion.any() and not found.hands["left"].ambient.any()
+    assert found.object.occlusion.shape == playback.object.occlusion.shape
+    bare = replace(playback.object, ambient=torch.zeros(3))
+    expected = replace(playback, object=bare).gaussians([1], ["object"]).colors
+    torch.testing.assert_close(found.gaussians([1], ["object"]).colors, expected)
 
 
 @pytest.mark.parametrize(

@@ -157,6 +157,8 @@ def test_lighting_changes_colours_alone() -> None:
         normals, shade = third_axis(plain.quats), lighting.shade[entity]
         power = quadratic_basis(normals) @ lighting.clip + shade[:, None, :1] + normals @ shade[:, 1:4, None]
         power = power + canonical[entity].weights @ shade[:, 4:, None]
+        covered = lighting.occlusion[entity].at(scene.splats(entity).base_points)
+        power = power + covered[..., None] * lighting.ambient[entity]
         torch.testing.assert_close(with_light.colors, plain.colors * power.exp())
         assert with_light.colors.shape == (FRAMES, *plain.colors.shape)
         assert not torch.allclose(with_light.colors, plain.colors.expand_as(with_light.colors))

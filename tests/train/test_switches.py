@@ -76,7 +76,9 @@ def test_our_switches() -> None:
     assert GraspStage not in kinds(grasps)
     assert groups(FAST) - groups(grasps) == {"hand.grasp_orient", "hand.grasp_pose", "hand.grasp_position"}
     lighting = without(FAST, "lighting")
-    assert not lighting.lighting and not {"scene.light", "scene.shade"} & groups(lighting)
+    assert not lighting.lighting
+    assert groups(FAST) - groups(lighting) == {"scene.light", "scene.shade", "scene.ambient"}
+    assert groups(FAST) - groups(without(FAST, "ambient")) == {"scene.ambient"}
     labels = without(FAST, "labels")
     assert {stage.labels_weight for stage in labels.stages if isinstance(stage, ScaleSearchStage)} == {0.0}
     sizes = [stage.image_size for stage in FAST.stages if isinstance(stage, OptimizeStage)]

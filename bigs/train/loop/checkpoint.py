@@ -21,7 +21,7 @@ from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.density import Pull
 from bigs.train.loop.run_stage import NUMBERS, StageState
 
-FORMAT = "bigs-checkpoint-4"
+FORMAT = "bigs-checkpoint-5"
 FILE_NAME = "latest.safetensors"
 
 
@@ -112,6 +112,10 @@ def load_checkpoint(folder: Path, scene: Scene, digest: str) -> Position | None:
         scene.object_splats.place(Anchors(*(tensors[f"scene.object_splats.{n}"] for n in Anchors._fields)))
     if "scene.surface_verts" in tensors:
         scene.replace_surface(ObjectSurface(tensors["scene.surface_verts"], tensors["scene.surface_faces"]))
+    if scene.lighting is not None:
+        for entity, occlusion in scene.lighting.occlusion.items():
+            known = f"scene.lighting.occlusion.{entity}"
+            occlusion.place(tensors[f"{known}.places"], tensors[f"{known}.shares"])
     scene.load_state_dict(
         {name.removeprefix("scene."): value for name, value in tensors.items() if name.startswith("scene.")}
     )

@@ -13,7 +13,7 @@ from bigs.models.poses import HandPoses, ObjectPoses
 from bigs.models.scene import Scene
 from bigs.train.loop.adam import FrameAdam
 
-_LIGHT = {"light": "clip", "shade": "shade"}
+_LIGHT = {"light": "clip", "shade": "shade", "ambient": "ambient"}
 # Group name -> its parameters, below a hand's or the object's modules.
 _HAND_FIELD = ("triplane", "appearance", "geometry", "skinning", "color")
 _HAND_POSE = ("betas", "orient", "pose", "pose_bias", "ray", "depth")
@@ -27,6 +27,7 @@ GROUPS = (
     *(f"object.{name}" for name in (*_OBJECT_FIELD, *_DETAIL, "orient", "ray", "depth", "scale")),
     "scene.light",
     "scene.shade",
+    "scene.ambient",
 )
 # Parameters with one row per frame. A step that does not look at a frame says nothing about its rotations and
 # fingers; rays and depths gain from momentum and from smoothness in time.

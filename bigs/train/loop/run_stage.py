@@ -13,6 +13,7 @@ from torch import Tensor
 from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
 from bigs.models.object_splats import ObjectSplats
+from bigs.models.occlusion import measure_occlusion
 from bigs.models.scene import Scene
 from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.density import Pull, densified
@@ -119,6 +120,8 @@ def run_stage(
         raise InputError(f"stage {stage.name}: expected a network for the term 'perceptual', found none")
     if "sds" in stage.weights and evidence.denoiser is None:
         raise InputError(f"stage {stage.name}: expected a prior's model for the term 'sds', found none")
+    if resume is None and "scene.ambient" in stage.lrs and scene.lighting is not None:
+        measure_occlusion(scene)
     optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments, stage.adam_betas)
     state = StageState.begun(0, optimizer)
     densify = None if scene.object_splats is None else stage.densify

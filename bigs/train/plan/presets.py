@@ -116,6 +116,7 @@ _APPEARANCE = OptimizeStage(
         "object.geometry": 5e-4,
         "scene.light": 1e-2,
         "scene.shade": 1e-2,
+        "scene.ambient": 1e-2,
     },
     weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
     image_size=240,
@@ -179,6 +180,7 @@ _JOINT = OptimizeStage(
         "object.ray": 0.0005,
         "scene.light": 2e-3,
         "scene.shade": 1e-2,
+        "scene.ambient": 1e-2,
     },
     weights={
         "image": 4.0,
@@ -220,6 +222,7 @@ _DETAIL = OptimizeStage(
         "object.ray": 0.0002,
         "scene.light": 2e-3,
         "scene.shade": 1e-2,
+        "scene.ambient": 1e-2,
     },
     weights={
         "image": 4.0,

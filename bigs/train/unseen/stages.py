@@ -7,6 +7,7 @@ from typing import Any
 
 from bigs.geometry.symmetry import Symmetry
 from bigs.guidance.denoiser import Denoiser
+from bigs.models.occlusion import measure_occlusion
 from bigs.models.scene import Scene
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageState
@@ -28,7 +29,7 @@ def run_completion(
     earlier: Sequence[Symmetry],
 ) -> StageOutcome:
     """Complete the object by its symmetries; see `complete_scene`."""
-    return complete_scene(
+    done = complete_scene(
         scene,
         sources.clip,
         sources.unknown,
@@ -39,6 +40,10 @@ def run_completion(
         config.object,
         earlier,
     )
+    if scene.lighting is not None and scene.lighting.measured:
+        # For the surface as it is now, and for the Gaussians there.
+        measure_occlusion(scene)
+    return done
 
 
 def run_guidance(

@@ -1,5 +1,5 @@
 //! What a step of fitting hands and an object does around the renderer: posing Gaussians, comparing images, measuring
-//! distances, turning joints. Each is one pass over its data, with its gradient derived by hand, for `f32` and `f64`
+//! distances, turning joints, and how surfaces cover each other. Each is one pass over its data, with its gradient derived by hand, for `f32` and `f64`
 //! from the same source.
 //!
 //! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
@@ -25,6 +25,7 @@ pub mod hand_poses;
 pub mod joints;
 mod lanes;
 mod mat3;
+pub mod occlusion;
 pub mod pixels;
 pub mod pose;
 pub mod touch;

@@ -1,6 +1,6 @@
 //! Gradients of posing against finite differences, the same bits for any number of threads, and refusals.
 
-use bigs_ops::pose::{Light, Pose, PosedGaussians, Subject, Surface, Wanted};
+use bigs_ops::pose::{Ambient, Light, Pose, PosedGaussians, Subject, Surface, Wanted};
 
 const FRAMES: usize = 2;
 const BONES: usize = 3;
@@ -18,6 +18,8 @@ struct Owned {
     albedo: Vec<[f64; 3]>,
     parts: Vec<f64>,
     shade: Vec<f64>,
+    occlusion: Vec<f64>,
+    strength: [f64; 3],
 }
 
 fn owned(seed: u64, count: usize, moving: bool, mirrored: bool) -> Owned {
@@ -46,6 +48,8 @@ fn owned(seed: u64, count: usize, moving: bool, mirrored: bool) -> Owned {
         albedo: (0..count).map(|_| [next(), next(), next()]).collect(),
         parts: (0..count * PARTS).map(|_| next()).collect(),
         shade: (0..FRAMES * (4 + PARTS)).map(|_| 0.3 * next()).collect(),
+        occlusion: (0..FRAMES * count).map(|_| 0.5 + 0.5 * next()).collect(),
+        strength: [next(), next(), next()],
     }
 }
 
@@ -64,6 +68,10 @@ fn subject(own: &Owned) -> Subject<'_, f64> {
                 parts_each: PARTS,
                 parts: &own.parts,
                 shade: &own.shade,
+                ambient: Some(Ambient {
+                    occlusion: &own.occlusion,
+                    strength: own.strength,
+                }),
             }),
         }),
     }
@@ -151,6 +159,7 @@ fn gradients_are_finite_differences() {
             with(&|s| s.albedo.as_flattened_mut()[i] += h)
         });
         check("shade", &own.shade, &|i, h| with(&|s| s.shade[i] += h));
+        check("strength", &own.strength, &|i, h| with(&|s| s.strength[i] += h));
     }
     check("clip", found.clip.as_flattened(), &|i, h| {
         let mut changed = clip;

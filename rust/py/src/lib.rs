@@ -4,6 +4,7 @@ mod call;
 mod convert;
 mod hand_poses;
 mod measure;
+mod occlusion;
 mod pixels;
 mod pose;
 mod poses;
@@ -329,6 +330,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(poses::rotations_backward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_forward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(occlusion::form_factors, m)?)?;
     m.add_function(wrap_pyfunction!(touch::distances, m)?)?;
     m.add_function(wrap_pyfunction!(touch::touch_forward, m)?)?;
     m.add_function(wrap_pyfunction!(touch::touch_backward, m)?)?;

@@ -1,8 +1,8 @@
 //! Posing: the Python face of `bigs_ops::pose`.
 
-use bigs_ops::pose::{Light, Pose, Subject, Surface, Wanted};
+use bigs_ops::pose::{Ambient, Light, Pose, Subject, Surface, Wanted};
 use numpy::{Element, PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pyo3::exceptions::PyTypeError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyList, PyTuple};
 
@@ -19,14 +19,17 @@ struct Held<'py, T: Element> {
     surface: Option<[PyReadonlyArrayDyn<'py, T>; 2]>,
     /// Parts and shade.
     light: Option<[PyReadonlyArrayDyn<'py, T>; 2]>,
+    /// Occlusion and its strength.
+    ambient: Option<[PyReadonlyArrayDyn<'py, T>; 2]>,
     mirrored: bool,
 }
 
 impl<'py, T: Kind> Held<'py, T> {
-    /// Reads (points, weights, bones, quats | None, albedo | None, parts | None, shade | None, mirrored).
+    /// Reads (points, weights, bones, quats | None, albedo | None, parts | None, shade | None, occlusion | None,
+    /// ambient | None, mirrored).
     fn extract(subject: &Bound<'py, PyTuple>) -> PyResult<Self> {
-        if subject.len() != 8 {
-            return Err(PyTypeError::new_err("subject: expected eight entries"));
+        if subject.len() != 10 {
+            return Err(PyTypeError::new_err("subject: expected ten entries"));
         }
         let two = |names: [&str; 2], at: usize| -> PyResult<Option<[PyReadonlyArrayDyn<'py, T>; 2]>> {
             let first = subject.get_item(at)?;
@@ -42,17 +45,31 @@ impl<'py, T: Kind> Held<'py, T> {
             bones: slice("bones", &subject.get_item(2)?)?,
             surface: two(["quats", "albedo"], 3)?,
             light: two(["parts", "shade"], 5)?,
-            mirrored: subject.get_item(7)?.extract()?,
+            ambient: two(["occlusion", "ambient"], 7)?,
+            mirrored: subject.get_item(9)?.extract()?,
         })
     }
 
     fn subject(&self) -> PyResult<Subject<'_, T>> {
+        let ambient = match &self.ambient {
+            None => None,
+            Some([occlusion, strength]) => {
+                let &[strength] = rows("ambient", strength)? else {
+                    return Err(PyValueError::new_err("ambient: expected one row"));
+                };
+                Some(Ambient {
+                    occlusion: contiguous("occlusion", occlusion)?,
+                    strength,
+                })
+            }
+        };
         let light = match &self.light {
             None => None,
             Some([parts, shade]) => Some(Light {
                 parts_each: parts.shape().last().copied().unwrap_or(0),
                 parts: contiguous("parts", parts)?,
                 shade: contiguous("shade", shade)?,
+                ambient,
             }),
         };
         let surface = match &self.surface {
@@ -141,6 +158,7 @@ impl<'py, T: Kind> Scene<'py, T> {
                     gradient(py, own.quats.into_flattened()),
                     gradient(py, own.albedo.into_flattened()),
                     gradient(py, own.shade),
+                    gradient(py, own.strength.to_vec()),
                 )
                     .into_pyobject(py)
             })
@@ -161,7 +179,8 @@ fn are_single(subjects: &[Bound<'_, PyTuple>]) -> bool {
 /// Carries subjects to `frames` frames.
 ///
 /// A subject is (points `[N, 3]` or `[B, N, 3]`, weights `[N, K]`, bones `[B, K, 3 or 4, 4]`, quats `[N, 4]` or None,
-/// albedo `[N, 3]` or None, parts `[N, J]` or None, shade `[B, 4 + J]` or None, mirrored); clip is `[8, 3]` or None. All are
+/// albedo `[N, 3]` or None, parts `[N, J]` or None, shade `[B, 4 + J]` or None, occlusion `[B, N]`
+/// or None, ambient `[3]` or None, mirrored); clip is `[8, 3]` or None. All are
 /// C-contiguous, float32 or float64 throughout.
 ///
 /// Returns (means, quats, colors), flat. Raises ValueError.
@@ -180,7 +199,7 @@ pub(crate) fn pose_forward<'py>(
     }
 }
 
-/// Gradients of each subject's points, weights, bones, quats, albedo and shade, flat, and of the clip's light; what is not
+/// Gradients of each subject's points, weights, bones, quats, albedo, shade and ambient, flat, and of the clip's light; what is not
 /// wanted is an empty array. Takes the arguments of the forward call and the gradients of its results or None.
 #[pyfunction]
 pub(crate) fn pose_backward<'py>(

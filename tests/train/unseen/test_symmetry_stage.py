@@ -88,7 +88,7 @@ def test_the_shape_gains_and_nothing_that_was_seen_changes(
     assert scores[1].f5 > scores[0].f5 and scores[1].f10 >= scores[0].f10
     # Gaussians: those that show are left to the last bit, in front of the new ones; of the rest none is.
     old, new = plain[0].object_splats, completed[0].object_splats
-    left = int((new.base_means[:, None] == old.base_means[None]).all(-1).any(1).sum())
+    left = int((new.base_points[:, None] == old.base_points[None]).all(-1).any(1).sum())
     assert 0.3 * len(old.shift) < left < len(old.shift) < len(new.shift) + len(old.shift) - left
     assert not any(parameter.requires_grad for parameter in completed[0].parameters())
 
@@ -113,8 +113,8 @@ def test_what_is_added_shows_in_no_frame(
         TargetSource(clip, np.zeros((len(clip), 180, 240), dtype=bool)), completed[0], PLAN, None
     )
     evidence = sources.evidence(replace(SMOKE.stages[0], image_size=240))
-    known = plain[0].object_splats.base_means
-    new = ~(completed[0].object_splats.base_means[:, None] == known[None]).all(-1).any(1)
+    known = plain[0].object_splats.base_points
+    new = ~(completed[0].object_splats.base_points[:, None] == known[None]).all(-1).any(1)
     assert int(new.sum()) > 100
     assert float(weights_in_pictures(completed[0], evidence)[new].max()) < 0.05
     everything = torch.arange(len(clip))

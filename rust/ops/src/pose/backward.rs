@@ -5,7 +5,8 @@ use bigs_raster::{Simd, Vectors, Work};
 use crate::lanes::{Lanes, conjugate, product};
 use crate::pose::bones::{Bone, Bones};
 use crate::pose::chunk::{
-    CHUNK, Inputs, Lit, Row, add, blend, load, mirror_point, mirror_turn, points, rows, store, write,
+    CHUNK, FrameLight, Inputs, Lit, Row, add, blend, load, mirror_point, mirror_turn, occlusion, points,
+    rows, store, write,
 };
 use crate::pose::light::{CLIP, basis_vjp};
 use crate::pose::{Subject, Wanted};
@@ -52,6 +53,8 @@ pub(super) struct ChunkGradients<T> {
     pub(super) bones: Vec<Bone<T>>,
     pub(super) shade: Vec<T>,
     pub(super) clip: [[T; 3]; CLIP],
+    /// Of the strength of ambient occlusion.
+    pub(super) strength: [T; 3],
 }
 
 pub(super) struct Backward<'a, T> {
@@ -109,6 +112,7 @@ struct Sums<T: Vectors, S: Simd> {
     /// Constant and slope of the frame's shade.
     shade: [Lanes<T, S>; 4],
     clip: [[Lanes<T, S>; CLIP]; 3],
+    strength: [Lanes<T, S>; 3],
 }
 
 impl<T: Vectors> Work for Backward<'_, T> {
@@ -140,6 +144,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
             ],
             shade: zeros(wanted.light, frames * shades),
             clip: [[T::ZERO; 3]; CLIP],
+            strength: [T::ZERO; 3],
         };
         let mut v_points = [[T::ZERO; CHUNK]; 3];
         let mut v_weights = vec![[T::ZERO; CHUNK]; if wanted.weights { self.bones.count } else { 0 }];
@@ -149,6 +154,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
         };
         let mut v_shaded = [T::ZERO; CHUNK];
         let mut clip_sums = [[Lanes::<T, S>::zero(simd); CLIP]; 3];
+        let mut strength_sums = [Lanes::<T, S>::zero(simd); 3];
         let mut at_rest = rows(points(subject, 0, first, len));
         for frame in 0..frames {
             if subject.moves() && frame > 0 {
@@ -161,7 +167,16 @@ impl<T: Vectors> Work for Backward<'_, T> {
             let mut sums = Sums {
                 shade: [Lanes::<T, S>::zero(simd); 4],
                 clip: clip_sums,
+                strength: strength_sums,
             };
+            let covered = occlusion(subject, frame, first, len);
+            let light = light.map(|light| FrameLight {
+                clip: self.clip,
+                shade: light.of_frame(frame),
+                parts: &inputs.parts,
+                occlusion: &covered,
+                strength: light.strength(),
+            });
             for at in (0..len).step_by(Lanes::<T, S>::COUNT) {
                 let [x, y, z] = load(simd, &at_rest, at);
                 let v_mean = mirror_point(load(simd, &v_means, at), subject.mirrored);
@@ -191,10 +206,9 @@ impl<T: Vectors> Work for Backward<'_, T> {
                 let (bone, quat) = ([w, x, y, z], load(simd, &inputs.quats, at));
                 let mut v_turn: [_; 4] = load(simd, &v_turned, at);
                 let v_color: [_; 3] = load(simd, &v_colors, at);
-                if let Some(light) = light {
+                if let Some(light) = &light {
                     let turned = mirror_turn(product(bone, quat), subject.mirrored);
-                    let shade = light.of_frame(frame);
-                    let lit = Lit::of(simd, turned, self.clip, shade, &inputs.parts, at);
+                    let lit = Lit::of(simd, turned, light, at);
                     let mut v_power = v_color;
                     for c in 0..3 {
                         v_power[c] = v_color[c] * lit.factor[c];
@@ -213,6 +227,10 @@ impl<T: Vectors> Work for Backward<'_, T> {
                     for i in 0..3 {
                         sums.shade[1 + i] = axis[i].times_plus(shared, sums.shade[1 + i]);
                     }
+                    let covered = Lanes::load(simd, &covered[at..]);
+                    for c in 0..3 {
+                        sums.strength[c] = covered.times_plus(v_power[c], sums.strength[c]);
+                    }
                     let mut v_basis = [Lanes::zero(simd); CLIP];
                     for b in 0..CLIP {
                         for c in 0..3 {
@@ -223,7 +241,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
                     }
                     let mut v_axis = basis_vjp(simd, axis, v_basis);
                     for i in 0..3 {
-                        v_axis[i] = shared.times_plus(Lanes::splat(simd, shade[1 + i]), v_axis[i]);
+                        v_axis[i] = shared.times_plus(Lanes::splat(simd, light.shade[1 + i]), v_axis[i]);
                     }
                     let v_normal = lit.normal.vjp(v_axis);
                     for i in 0..4 {
@@ -242,6 +260,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
                 }
             }
             clip_sums = sums.clip;
+            strength_sums = sums.strength;
             if wanted.bones {
                 let own = &mut out.bones[frame * self.bones.count..][..self.bones.count];
                 v_blended.add_to_bones(simd, &inputs.weights, len, own);
@@ -272,6 +291,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
                 out.clip[b][c] = sum;
             }
         }
+        out.strength = Lanes::sums(&strength_sums);
         if wanted.quats {
             out.quats.resize(len, [T::ZERO; 4]);
             write(&v_quats, &mut out.quats);

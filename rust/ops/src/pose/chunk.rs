@@ -108,6 +108,24 @@ impl<T: Vectors> Inputs<T> {
     }
 }
 
+/// What covers the sky above a chunk in one frame; zero without ambient light.
+pub(super) fn occlusion<T: Vectors>(
+    subject: &Subject<'_, T>,
+    frame: usize,
+    first: usize,
+    len: usize,
+) -> Row<T> {
+    let mut row = [T::ZERO; CHUNK];
+    if let Some(ambient) = subject
+        .surface
+        .and_then(|surface| surface.light)
+        .and_then(|light| light.ambient)
+    {
+        row[..len].copy_from_slice(&ambient.occlusion[frame * subject.count + first..][..len]);
+    }
+    row
+}
+
 /// The rest points of a chunk in one frame.
 pub(super) fn points<'a, T>(
     subject: &Subject<'a, T>,
@@ -168,6 +186,15 @@ pub(super) fn mirror_turn<T: Vectors, S: Simd>(
     if mirrored { [w, x, -y, -z] } else { [w, x, y, z] }
 }
 
+/// The light of one frame on a chunk.
+pub(super) struct FrameLight<'a, T> {
+    pub(super) clip: &'a [[T; 3]; CLIP],
+    pub(super) shade: &'a [T],
+    pub(super) parts: &'a [Row<T>],
+    pub(super) occlusion: &'a Row<T>,
+    pub(super) strength: [T; 3],
+}
+
 /// The factor of light on the Gaussians at `at`, and the normal and its harmonics that it is a function of.
 pub(super) struct Lit<T: Vectors, S: Simd> {
     pub(super) factor: [Lanes<T, S>; 3],
@@ -177,27 +204,23 @@ pub(super) struct Lit<T: Vectors, S: Simd> {
 
 impl<T: Vectors, S: Simd> Lit<T, S> {
     #[inline(always)]
-    pub(super) fn of(
-        simd: S,
-        quat: Four<Lanes<T, S>>,
-        clip: &[[T; 3]; CLIP],
-        shade: &[T],
-        parts: &[Row<T>],
-        at: usize,
-    ) -> Self {
+    pub(super) fn of(simd: S, quat: Four<Lanes<T, S>>, light: &FrameLight<'_, T>, at: usize) -> Self {
+        let shade = light.shade;
         let normal = Normal::of(simd, quat);
         let basis = basis(simd, normal.axis);
         let mut shaded = Lanes::splat(simd, shade[0]);
         for i in 0..3 {
             shaded = normal.axis[i].times_plus(Lanes::splat(simd, shade[1 + i]), shaded);
         }
-        for (part, &shade) in parts.iter().zip(&shade[4..]) {
+        for (part, &shade) in light.parts.iter().zip(&shade[4..]) {
             shaded = Lanes::load(simd, &part[at..]).times_plus(Lanes::splat(simd, shade), shaded);
         }
+        let covered = Lanes::load(simd, &light.occlusion[at..]);
         let mut factor = [shaded; 3];
         for c in 0..3 {
+            factor[c] = covered.times_plus(Lanes::splat(simd, light.strength[c]), factor[c]);
             for b in 0..CLIP {
-                factor[c] = basis[b].times_plus(Lanes::splat(simd, clip[b][c]), factor[c]);
+                factor[c] = basis[b].times_plus(Lanes::splat(simd, light.clip[b][c]), factor[c]);
             }
             factor[c] = factor[c].exp(simd);
         }

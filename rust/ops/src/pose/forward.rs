@@ -6,7 +6,8 @@ use crate::lanes::{Lanes, product};
 use crate::pose::Subject;
 use crate::pose::bones::Bones;
 use crate::pose::chunk::{
-    CHUNK, Inputs, Lit, blend, carry, load, mirror_point, mirror_turn, points, rows, store, write,
+    CHUNK, FrameLight, Inputs, Lit, blend, carry, load, mirror_point, mirror_turn, occlusion, points, rows,
+    store, write,
 };
 use crate::pose::light::CLIP;
 
@@ -54,6 +55,14 @@ impl<T: Vectors> Work for Forward<'_, '_, T> {
                 at_rest = rows(points(subject, frame, first, len));
             }
             let bones = self.bones.of_frame(frame);
+            let covered = occlusion(subject, frame, first, len);
+            let light = light.map(|light| FrameLight {
+                clip: self.clip,
+                shade: light.of_frame(frame),
+                parts: &inputs.parts,
+                occlusion: &covered,
+                strength: light.strength(),
+            });
             for at in (0..len).step_by(Lanes::<T, S>::COUNT) {
                 let rest = load(simd, &at_rest, at);
                 if subject.surface.is_none() {
@@ -76,9 +85,8 @@ impl<T: Vectors> Work for Forward<'_, '_, T> {
                 let turned = mirror_turn(turned, subject.mirrored);
                 store(turned, &mut quats, at);
                 let mut shown: [_; 3] = load(simd, &inputs.albedo, at);
-                if let Some(light) = light {
-                    let shade = light.of_frame(frame);
-                    let lit = Lit::of(simd, turned, self.clip, shade, &inputs.parts, at);
+                if let Some(light) = &light {
+                    let lit = Lit::of(simd, turned, light, at);
                     for c in 0..3 {
                         shown[c] = shown[c] * lit.factor[c];
                     }

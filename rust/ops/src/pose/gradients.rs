@@ -20,7 +20,7 @@ pub struct Wanted {
     pub quats: bool,
     /// Of albedos.
     pub albedo: bool,
-    /// Of shade; the clip's light comes with it.
+    /// Of shade and of the strength of ambient occlusion; the clip's light comes with them.
     pub light: bool,
 }
 
@@ -34,6 +34,7 @@ pub struct SubjectGradients<T> {
     pub quats: Vec<[T; 4]>,
     pub albedo: Vec<[T; 3]>,
     pub shade: Vec<T>,
+    pub strength: [T; 3],
 }
 
 /// Gradients of all that was posed.
@@ -60,6 +61,7 @@ pub(super) fn joined<T: Vectors>(
         quats: Vec::new(),
         albedo: Vec::new(),
         shade: Vec::new(),
+        strength: [T::ZERO; 3],
     };
     if wanted.points && subject.moves() {
         out.points = vec![[T::ZERO; 3]; frames * subject.count];
@@ -85,6 +87,9 @@ pub(super) fn joined<T: Vectors>(
         out.quats.extend_from_slice(&chunk.quats);
         out.albedo.extend_from_slice(&chunk.albedo);
         add_all(&mut out.shade, &chunk.shade);
+        if wanted.light {
+            add_all(&mut out.strength, &chunk.strength);
+        }
         add_all(v_bones.as_flattened_mut(), chunk.bones.as_flattened());
     }
     out.bones = bones.vjp(&v_bones, subject.bone_size);

@@ -63,11 +63,28 @@ pub struct Light<'a, T> {
     pub parts: &'a [T],
     /// B × (4 + J): a constant, a slope along the normal, and a constant for each part.
     pub shade: &'a [T],
+    /// None where nothing takes light from a Gaussian.
+    pub ambient: Option<Ambient<'a, T>>,
 }
 
-impl<T> Light<'_, T> {
-    fn of_frame(&self, frame: usize) -> &[T] {
+/// What surfaces near a Gaussian take of its light.
+#[derive(Clone, Copy, Debug)]
+pub struct Ambient<'a, T> {
+    /// B × N: the share of the sky that they cover (see [`crate::occlusion`]).
+    pub occlusion: &'a [T],
+    /// The logarithm of a colour's factor where all of the sky is covered.
+    pub strength: [T; 3],
+}
+
+impl<'a, T> Light<'a, T> {
+    fn of_frame(&self, frame: usize) -> &'a [T] {
         &self.shade[frame * (4 + self.parts_each)..][..4 + self.parts_each]
+    }
+}
+
+impl<T: Vectors> Light<'_, T> {
+    fn strength(&self) -> [T; 3] {
+        self.ambient.map_or([T::ZERO; 3], |ambient| ambient.strength)
     }
 }
 
@@ -140,6 +157,9 @@ impl<'a, T: Vectors> Pose<'a, T> {
                     check_length("parts", n * light.parts_each, light.parts.len())?;
                     check_length("shade", frames * (4 + light.parts_each), light.shade.len())?;
                     check_length("clip", CLIP, clip.map_or(0, <[_]>::len))?;
+                    if let Some(ambient) = &light.ambient {
+                        check_length("occlusion", frames * n, ambient.occlusion.len())?;
+                    }
                 }
             }
         }
