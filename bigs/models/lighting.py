@@ -48,7 +48,7 @@ class Occlusion(nn.Module):
         self.places, self.shares, self._known = places, shares, None
 
     def at(self, points: Tensor) -> Tensor:
-        """Shares [T, N] in steps of 1 / `LEVELS` at points [N, 3] of the rest space; kept for the next call."""
+        """Shares [T, N] in steps of 1 / `LEVELS` at points [N, 3] of the rest space; kept for later."""
         versions = tuple(tensor._version for tensor in (points, self.places, self.shares))
         if self._known is None or self._known[0] != versions or self._known[1] is not points:
             self._known = versions, points, self._between(points)

@@ -292,7 +292,7 @@ def test_an_interrupted_runs_report_is_whole(
 
 def test_another_format_is_named(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:
     save_file({"x": torch.zeros(1)}, tmp_path / FILE_NAME)
-    with pytest.raises(InputError, match="expected format bigs-checkpoint-4, found None"):
+    with pytest.raises(InputError, match="expected format bigs-checkpoint-5, found None"):
         load_checkpoint(tmp_path, cube_scene(both_hands), "digest")
 
 
