@@ -196,7 +196,8 @@ _JOINT = OptimizeStage(
 )
 
 # The same at nearly the images' own size, where poses are nearly right and print on a label can be seen.
-# Without the hands' silhouettes, which would take more time there than they are worth.
+# Without the hands' silhouettes and without labels: who hides whom is settled by then, and a rendering with
+# three channels takes less time than one with six.
 _DETAIL = OptimizeStage(
     name="detail",
     step="interacting-subjects",
@@ -228,7 +229,6 @@ _DETAIL = OptimizeStage(
         "image": 4.0,
         "mse": 300.0,
         "alpha_outside": 25.0,
-        "labels": 2.0,
         **_PLAUSIBLE_TOGETHER,
     },
     image_size=480,
