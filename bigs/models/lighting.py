@@ -32,7 +32,7 @@ _BETWEEN, _NEAREST = 3, 1e-4
 
 
 class Occlusion(nn.Module):
-    """How much of the sky above one subject is covered, at samples of its surface in every frame."""
+    """Ambient occlusion: how much of the sky above a subject is covered, at samples of it in every frame."""
 
     places: Tensor
     shares: Tensor

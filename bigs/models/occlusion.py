@@ -1,4 +1,4 @@
-"""How much of the sky the subjects cover for each other, measured on their surfaces as they are posed."""
+"""Ambient occlusion: how much of the sky hands and object cover for each other as they are posed."""
 
 from __future__ import annotations
 

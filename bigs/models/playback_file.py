@@ -20,6 +20,7 @@ from bigs.checks import (
     check_faces,
     check_finite,
     check_pixels,
+    check_product,
     check_rotations,
     check_shape,
     shown,
@@ -97,7 +98,7 @@ def load_playback(path: Path) -> Playback:
     if facts["format"] == _UNSUMMED:
         tensors |= _without_grasps(tensors)
     if facts["format"] != FORMAT:
-        tensors |= _without_occlusion(tensors)
+        tensors |= _without_occlusion(str(path), tensors)
     _check(str(path), facts, tensors)
     return _assemble(facts, tensors)
 
@@ -113,12 +114,13 @@ def _without_grasps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return found
 
 
-def _without_occlusion(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What stands for occlusion that a file of an earlier version lacks: nothing covers anything."""
+def _without_occlusion(where: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What stands for the occlusion that a file of an earlier version lacks: nothing covers anything."""
     found: dict[str, Tensor] = {}
     for entity, splats in (("right", "points"), ("left", "points"), ("object", "means")):
         shade, points = (tensors.get(f"{entity}.{name}") for name in ("shade", f"splats.{splats}"))
         if shade is not None and points is not None and shade.ndim and points.ndim:
+            check_product(f"{where}: {entity}", len(shade), len(points))
             found[f"{entity}.occlusion"] = torch.zeros(len(shade), len(points), dtype=torch.uint8)
             found[f"{entity}.ambient"] = torch.zeros(3)
     return found

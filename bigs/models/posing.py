@@ -29,7 +29,7 @@ class Part(NamedTuple):
     opacities: Tensor  # [N]
 
     def lit(self, parts: Tensor, shade: Tensor, covered: Covered | None = None) -> Part:
-        """With the shade [B, 4 + J] of its frames; parts [N, J] as in `lighting`."""
+        """With the shade [B, 4 + J] of its frames, and what covers it; parts [N, J] as in `lighting`."""
         # Light does not change how a hand bends.
         posing = self.posing._replace(parts=parts.detach(), shade=shade)
         if covered is not None:

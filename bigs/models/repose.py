@@ -31,7 +31,7 @@ def wrist_of(hand: HandPlayback) -> tuple[Tensor, Tensor]:
 def repose(
     hand: HandPlayback, side: Side, hand_pose: Tensor, global_orient: Tensor, wrist: Tensor
 ) -> HandPlayback:
-    """The hand in other poses; shape, Gaussians and, frame by frame, shade stay.
+    """The hand in other poses; shape, Gaussians and, frame by frame, shade and occlusion stay.
 
     Args:
         hand: T frames.

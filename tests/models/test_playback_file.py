@@ -90,6 +90,17 @@ def test_a_scene_of_before_there_was_occlusion(whole: Path, forge: Callable[...,
     torch.testing.assert_close(found.gaussians([1], ["object"]).colors, expected)
 
 
+def test_an_earlier_scene_of_too_many_frames_and_gaussians(forge: Callable[..., Path]) -> None:
+    """What stands for its occlusion has a byte for each of a product that the file does not hold."""
+    many = {
+        "object.shade": torch.zeros(100_000, 20),
+        "object.splats.means": torch.zeros(100_000, 3),
+        "object.occlusion": None,
+    }
+    with pytest.raises(InputError, match=r"object: expected at most .* found 100000 frames of 100000"):
+        load_playback(forge({"format": "bigs-scene-4"}, many))
+
+
 @pytest.mark.parametrize(
     "text", ["{", "[]", "null", "7", "[" * 100_000, '{"format": ' + "9" * 5000 + "}", '{"format": [1]}']
 )
