@@ -33,7 +33,7 @@ _FIELD_RATES = {
 }
 
 # Terms that fields have nothing for.
-_TERMS_OF_FREE_GAUSSIANS = ("color_prior", "thickness")
+_TERMS_OF_FREE_GAUSSIANS = ("color_prior", "thickness", "hand_color_prior", "hand_thickness")
 
 
 @dataclass(frozen=True)

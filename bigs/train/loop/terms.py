@@ -15,7 +15,7 @@ from bigs.guidance.schedule import SdsConfig
 from bigs.guidance.sds import sds_loss
 from bigs.losses.regularizers import color_spread, lbs_deviation, scale_size, squared_norm
 from bigs.losses.weighted import mean_of
-from bigs.models.object_detail import ObjectDetail
+from bigs.models.free_gaussians import FreeGaussians
 from bigs.train.loop import image_terms, pose_terms
 from bigs.train.loop.step import Step
 from bigs.train.loop.virtual_views import object_orbit, render_object
@@ -61,8 +61,12 @@ def color_prior(step: Step) -> Tensor:
     Adam takes steps of one size, however little the pictures say. This holds what they hardly show, and is
     nothing against what they show well.
     """
-    splats = step.scene.object_splats
-    return squared_norm(splats.color) if isinstance(splats, ObjectDetail) else torch.zeros(())
+    return mean_of(squared_norm(free.color) for free in _free_object(step))
+
+
+def hand_color_prior(step: Step) -> Tensor:
+    """The same of the hands' free Gaussians."""
+    return mean_of(squared_norm(free.color) for free in _free_hands(step))
 
 
 def thickness(step: Step) -> Tensor:
@@ -70,10 +74,24 @@ def thickness(step: Step) -> Tensor:
 
     On outlines they would grow into spikes, which stand out where the camera sees them from aside.
     """
-    splats = step.scene.object_splats
-    if not isinstance(splats, ObjectDetail):
-        return torch.zeros(())
-    return squared_norm(splats.size[:, 2:].clamp_min(0.0))
+    return mean_of(_growth_across(free) for free in _free_object(step))
+
+
+def hand_thickness(step: Step) -> Tensor:
+    """The same of the hands' free Gaussians."""
+    return mean_of(_growth_across(free) for free in _free_hands(step))
+
+
+def _growth_across(free: FreeGaussians) -> Tensor:
+    return squared_norm(free.size[:, 2:].clamp_min(0.0))
+
+
+def _free_object(step: Step) -> list[FreeGaussians]:
+    return [splats for splats in (step.scene.object_splats,) if isinstance(splats, FreeGaussians)]
+
+
+def _free_hands(step: Step) -> list[FreeGaussians]:
+    return [splats for splats in step.scene.hand_splats.values() if isinstance(splats, FreeGaussians)]
 
 
 def sds(step: Step) -> Tensor:
@@ -151,6 +169,8 @@ TERMS: dict[str, Term] = {
         offset=offset,
         color_prior=color_prior,
         thickness=thickness,
+        hand_color_prior=hand_color_prior,
+        hand_thickness=hand_thickness,
         sds=sds,
     ),
     **_of_poses(

@@ -283,6 +283,8 @@ DEMO = replace(
 # of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said: colours,
 # which light and shade never explain altogether, would in time turn it by some tenths of a degree.
 _FIRM_OBJECT = {"object_prior": 50.0}
+# So many steps would also turn knuckles that the camera hardly sees into sparks.
+_CALM_HANDS = {"hand_color_prior": 0.015, "hand_thickness": 0.15}
 FULL = replace(
     FAST,
     hand=replace(FAST.hand, triplane=TriplaneConfig(features=24, resolution=192)),
@@ -300,13 +302,13 @@ FULL = replace(
         _CONTACT,
         _REGRASP,
         SplitStage(),
-        replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT),
+        replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
         replace(
             _DETAIL,
             steps=1000,
             image_size=640,
             lrs=_DETAIL.lrs | {"hand.pose": 0.0016, "hand.grasp_pose": 0.0008},
-            weights=_DETAIL.weights | _FIRM_OBJECT,
+            weights=_DETAIL.weights | _FIRM_OBJECT | _CALM_HANDS,
         ),
         CompletionStage(),
         GuidanceStage(steps=600),

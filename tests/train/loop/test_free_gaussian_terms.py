@@ -1,10 +1,11 @@
-"""What holds free Gaussians of the object where pictures say little."""
+"""What holds free Gaussians where pictures say little."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
+from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.train.loop.step import Evidence, Selection, Step
@@ -26,13 +27,27 @@ def detail(scene: Scene) -> ObjectDetail:
     return scene.object_splats
 
 
+NAMES = ("color_prior", "thickness", "hand_color_prior", "hand_thickness")
+
+
 def test_a_field_costs_nothing(scene: Scene, evidence: Evidence) -> None:
-    assert loss("color_prior", scene, evidence) == loss("thickness", scene, evidence) == 0.0
+    assert all(loss(name, scene, evidence) == 0.0 for name in NAMES)
 
 
 @pytest.mark.usefixtures("detail")
 def test_fresh_gaussians_cost_nothing(scene: Scene, evidence: Evidence) -> None:
-    assert loss("color_prior", scene, evidence) == loss("thickness", scene, evidence) == 0.0
+    scene.hand_splats["right"] = free_hand(scene.hand_splats["right"])
+    assert all(loss(name, scene, evidence) == 0.0 for name in NAMES)
+
+
+def test_hands_have_prices_of_their_own(scene: Scene, evidence: Evidence, detail: ObjectDetail) -> None:
+    hand = scene.hand_splats["right"] = free_hand(scene.hand_splats["right"])
+    with torch.no_grad():
+        hand.color[3], hand.size[4, 2] = torch.tensor([0.0, 2.0, 0.0]), 0.5
+        detail.color[0], detail.size[1, 2] = 9.0, 9.0
+    count = len(hand.color)
+    assert loss("hand_color_prior", scene, evidence).item() == pytest.approx(4.0 / count, rel=1e-6)
+    assert loss("hand_thickness", scene, evidence).item() == pytest.approx(0.25 / count, rel=1e-6)
 
 
 def test_a_change_of_colour_costs_its_square(scene: Scene, evidence: Evidence, detail: ObjectDetail) -> None:
@@ -66,7 +81,5 @@ def test_what_keeps_fields_has_no_terms_of_free_gaussians() -> None:
         named = {name for stage in config.stages for name in getattr(stage, "weights", {})}
         assert {"color_prior", "thickness"} <= named
         fields = without(config, "split")
-        assert not {"color_prior", "thickness"} & {
-            name for stage in fields.stages for name in getattr(stage, "weights", {})
-        }
+        assert not set(NAMES) & {name for stage in fields.stages for name in getattr(stage, "weights", {})}
     assert without(PAPER, "split") == PAPER
