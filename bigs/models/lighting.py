@@ -90,7 +90,7 @@ class Lighting(nn.Module):
         self.ambient = nn.ParameterDict(
             {entity: nn.Parameter(torch.full((3,), _COVERED)) for entity in entities}
         )
-        # None until it is measured (see `bigs.models.occlusion`).
+        # Nothing is covered until it is measured (see `bigs.models.occlusion`).
         self.occlusion = nn.ModuleDict(  # type: ignore[assignment]
             {entity: Occlusion(n_frames) for entity in entities}
         )

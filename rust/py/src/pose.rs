@@ -199,8 +199,8 @@ pub(crate) fn pose_forward<'py>(
     }
 }
 
-/// Gradients of each subject's points, weights, bones, quats, albedo, shade and ambient, flat, and of the clip's light; what is not
-/// wanted is an empty array. Takes the arguments of the forward call and the gradients of its results or None.
+/// Gradients of each subject's points, weights, bones, quats, albedo, shade and ambient, flat, and of the clip's light; what
+/// is not wanted is an empty array, or zeros for ambient. Takes the arguments of the forward call and the gradients of its results or None.
 #[pyfunction]
 pub(crate) fn pose_backward<'py>(
     py: Python<'py>,
