@@ -170,13 +170,7 @@ impl<T: Vectors> Work for Backward<'_, T> {
                 strength: strength_sums,
             };
             let covered = occlusion(subject, frame, first, len);
-            let light = light.map(|light| FrameLight {
-                clip: self.clip,
-                shade: light.of_frame(frame),
-                parts: &inputs.parts,
-                occlusion: &covered,
-                strength: light.strength(),
-            });
+            let light = light.map(|light| FrameLight::of(light, self.clip, frame, &inputs.parts, &covered));
             for at in (0..len).step_by(Lanes::<T, S>::COUNT) {
                 let [x, y, z] = load(simd, &at_rest, at);
                 let v_mean = mirror_point(load(simd, &v_means, at), subject.mirrored);

@@ -4,9 +4,9 @@
 use bigs_raster::{Simd, Vectors};
 
 use crate::lanes::{Four, LONGEST, Lanes};
-use crate::pose::Subject;
 use crate::pose::bones::Bone;
 use crate::pose::light::{CLIP, Normal, basis};
+use crate::pose::{Light, Subject};
 
 /// Gaussians of one task. Fixed, so that sums do not depend on the number of threads; whole vectors of every level.
 pub(super) const CHUNK: usize = 128;
@@ -193,6 +193,24 @@ pub(super) struct FrameLight<'a, T> {
     pub(super) parts: &'a [Row<T>],
     pub(super) occlusion: &'a Row<T>,
     pub(super) strength: [T; 3],
+}
+
+impl<'a, T: Vectors> FrameLight<'a, T> {
+    pub(super) fn of(
+        light: &Light<'a, T>,
+        clip: &'a [[T; 3]; CLIP],
+        frame: usize,
+        parts: &'a [Row<T>],
+        occlusion: &'a Row<T>,
+    ) -> Self {
+        Self {
+            clip,
+            shade: light.of_frame(frame),
+            parts,
+            occlusion,
+            strength: light.strength(),
+        }
+    }
 }
 
 /// The factor of light on the Gaussians at `at`, and the normal and its harmonics that it is a function of.

@@ -56,13 +56,7 @@ impl<T: Vectors> Work for Forward<'_, '_, T> {
             }
             let bones = self.bones.of_frame(frame);
             let covered = occlusion(subject, frame, first, len);
-            let light = light.map(|light| FrameLight {
-                clip: self.clip,
-                shade: light.of_frame(frame),
-                parts: &inputs.parts,
-                occlusion: &covered,
-                strength: light.strength(),
-            });
+            let light = light.map(|light| FrameLight::of(light, self.clip, frame, &inputs.parts, &covered));
             for at in (0..len).step_by(Lanes::<T, S>::COUNT) {
                 let rest = load(simd, &at_rest, at);
                 if subject.surface.is_none() {
