@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -52,3 +53,26 @@ def impossible_turn(hand_pose: Tensor, turns: Tensor) -> Tensor:
         turns: [M, 15, 3, 3], see `hand.impossible_turns`.
     """
     return (hand_pose.flatten(1) @ turns.flatten(1).T).square().mean()
+
+
+# How far the outermost joint of a finger bends, of the joint before it: one tendon bends both.
+_TOGETHER = 2.0 / 3.0
+# Departures from that beyond this (radians) cost like themselves and not like their square: what a finger
+# presses on bends its tip as it likes.
+_PRESSED = 0.15
+
+
+def uncoupled_bending(hand_pose: Tensor, bends: Tensor) -> Tensor:
+    """Mean squared departure of outermost finger joints from two thirds of the joints before them.
+
+    Squared radians, less for large ones (pseudo-Huber loss). The share is that of relaxed human fingers
+    (Rijpkema and Girard, "Computer animation of knowledge-based human grasping", SIGGRAPH 1991).
+
+    Args:
+        hand_pose: rotations [T, 15, 3, 3].
+        bends: [2, 2, 4, 15, 3, 3], see `hand.bends`.
+    """
+    sine, cosine = (hand_pose.flatten(1) @ bends.reshape(16, -1).T).reshape(-1, 2, 8).unbind(1)
+    middle, outer = torch.atan2(sine, cosine).reshape(-1, 2, 4).unbind(1)
+    away = (outer - _TOGETHER * middle) / _PRESSED
+    return 2.0 * _PRESSED**2 * ((1.0 + away.square()).sqrt() - 1.0).mean()

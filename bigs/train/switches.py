@@ -252,7 +252,7 @@ _INGREDIENTS = {
     "pose_priors": Switch(
         "what keeps poses, depths and shape near their estimates",
         _terms(
-            *("orient_prior", "pose_prior", "fingers_even", "joint_axes"),
+            *("orient_prior", "pose_prior", "fingers_even", "joint_axes", "finger_tendons"),
             *("depth_prior", "betas_prior", "object_prior"),
         ),
     ),

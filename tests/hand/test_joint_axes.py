@@ -1,4 +1,7 @@
-"""Turns that finger joints cannot make: none in a pose of hinges, the sine of the angle in any other."""
+"""Turns that finger joints cannot make: none in a pose of hinges, the sine of the angle in any other.
+
+And how far the hinges bend, of which the outer follows the middle one.
+"""
 
 import math
 
@@ -6,8 +9,8 @@ import pytest
 import torch
 
 from bigs.geometry.rotations import axis_angle_to_matrix
-from bigs.hand import HandModel, impossible_turns
-from bigs.losses.regularizers import impossible_turn
+from bigs.hand import HandModel, bends, impossible_turns
+from bigs.losses.regularizers import impossible_turn, uncoupled_bending
 
 # Joints of MANO's fingers (index, middle, pinky, ring) that are hinges, and all that must not twist.
 HINGES = [3 * finger + place for finger in range(4) for place in (1, 2)]
@@ -77,4 +80,58 @@ def test_it_has_exact_gradients(hand: HandModel) -> None:
     assert torch.autograd.gradcheck(
         lambda values: impossible_turn(axis_angle_to_matrix(values), impossible_turns(hand)),
         pose.requires_grad_(),
+    )
+
+
+def bent(hand: HandModel, angles: dict[int, float]) -> torch.Tensor:
+    vectors = torch.zeros(1, 15, 3, dtype=torch.float64)
+    for joint, angle in angles.items():
+        vectors[0, joint] = angle * across(hand, joint)
+    return axis_angle_to_matrix(vectors)
+
+
+def bending_angles(hand: HandModel, pose: torch.Tensor) -> torch.Tensor:
+    """[2, 4] radians of the middle and outermost joints."""
+    sine, cosine = torch.einsum("...jab,jab->...", bends(hand), pose[0])
+    return torch.atan2(sine, cosine)
+
+
+@pytest.mark.parametrize("angle", [-1.9, -0.4, 0.3, 1.5, 2.5])
+@pytest.mark.parametrize("joint", HINGES)
+def test_a_hinge_bends_by_its_angle_and_no_other_bends(hand: HandModel, joint: int, angle: float) -> None:
+    finger, place = divmod(joint, 3)
+    angles = bending_angles(hand, bent(hand, {joint: angle}))
+    # MANO's hands bend about `across` or against it; the sign is the same for all their fingers.
+    assert angles[place - 1, finger].abs().item() == pytest.approx(abs(angle))
+    angles[place - 1, finger] = 0.0
+    assert angles.abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("angle", [-0.3, 0.5, 1.7])
+def test_fingers_that_follow_their_tendons_cost_nothing(hand: HandModel, angle: float) -> None:
+    """However their base joints bend and spread, and however a thumb bends."""
+    angles = {0: 0.7, 6: -0.2, 13: 0.5, 14: -0.9}
+    for finger in range(4):
+        angles |= {3 * finger + 1: angle, 3 * finger + 2: angle * 2.0 / 3.0}
+    pose = bent(hand, angles)
+    assert uncoupled_bending(pose, bends(hand)).item() < 1e-12
+
+
+def test_a_tip_that_is_pressed_back_costs_like_its_angle(hand: HandModel) -> None:
+    """A little departure costs its square, a large one less."""
+
+    def cost(away: float) -> float:
+        pose = bent(hand, {1: 0.6, 2: 0.4 + away, 4: 0.0, 5: 0.0})
+        return 4.0 * uncoupled_bending(pose, bends(hand)).item()
+
+    assert cost(0.01) == pytest.approx(0.01**2, rel=0.01)
+    assert cost(-0.01) == pytest.approx(cost(0.01), rel=1e-6)
+    assert cost(1.0) == pytest.approx(2.0 * (math.sqrt(1.0 + (1.0 / 0.15) ** 2) - 1.0) * 0.15**2)
+    assert cost(1.0) - cost(0.8) == pytest.approx(cost(0.8) - cost(0.6), rel=0.02)
+
+
+def test_tendons_have_exact_gradients(hand: HandModel) -> None:
+    pose = 0.4 * torch.randn(2, 15, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(
+        lambda values: uncoupled_bending(axis_angle_to_matrix(values), bends(hand)), pose.requires_grad_()
     )

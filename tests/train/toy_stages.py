@@ -10,7 +10,7 @@ from small_vgg import small_network
 from torch import Tensor
 from toy_scenes import cube_scene
 
-from bigs.hand import HandModel, impossible_turns
+from bigs.hand import HandModel, bends, impossible_turns
 from bigs.models.hand_splats import silhouette_hand
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
@@ -54,7 +54,8 @@ def random_evidence(scene: Scene) -> Evidence:
     touching = {side: torch.ones(FRAMES) for side in ("right", "left")}
     outlines = {side: silhouette_hand(scene.hand_model(side), 0.003, 0.004) for side in scene.sides}
     turns = {side: impossible_turns(scene.hand_model(side)) for side in scene.sides}
-    return Evidence(targets, touching, outlines, turns, "surface", RasterSettings(), small_network())
+    bending = {side: bends(scene.hand_model(side)) for side in scene.sides}
+    return Evidence(targets, touching, outlines, turns, bending, "surface", RasterSettings(), small_network())
 
 
 def values(scene: Scene) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bigs.guidance.denoiser import Denoiser
-from bigs.hand import impossible_turns
+from bigs.hand import bends, impossible_turns
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand
 from bigs.models.hand_splats import silhouette_hand
@@ -83,6 +83,7 @@ class EvidenceSource:
             self.touching(),
             silhouettes,
             {side: impossible_turns(self.scene.hand_model(side)) for side in self.scene.sides},
+            {side: bends(self.scene.hand_model(side)) for side in self.scene.sides},
             self.config.contact,
             self.config.raster,
             self.perceptual,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bigs.losses.contact import center_contact, fingers_on_surface, penetration, surface_contact
-from bigs.losses.regularizers import finger_unevenness, impossible_turn, squared_norm
+from bigs.losses.regularizers import finger_unevenness, impossible_turn, squared_norm, uncoupled_bending
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.losses.weighted import mean_of
 from bigs.train.loop.step import Step
@@ -64,6 +64,14 @@ def joint_axes(step: Step) -> Tensor:
     """How far finger joints turn about axes that they do not have, squared radians, a mean over hands."""
     return mean_of(
         impossible_turn(step.posed_clip.hand(side).hand_pose, step.evidence.impossible_turns[side])
+        for side in step.scene.sides
+    )
+
+
+def finger_tendons(step: Step) -> Tensor:
+    """How far outermost finger joints bend otherwise than their tendons tell, a mean over hands."""
+    return mean_of(
+        uncoupled_bending(step.posed_clip.hand(side).hand_pose, step.evidence.bends[side])
         for side in step.scene.sides
     )
 

@@ -30,6 +30,7 @@ class Evidence:
     touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as known
     silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands for this resolution
     impossible_turns: dict[Side, Tensor]  # [M, 15, 3, 3] what finger joints cannot do, of canonical hands
+    bends: dict[Side, Tensor]  # [2, 2, 4, 15, 3, 3] how far finger joints bend, of canonical hands
     contact: str  # "center" or "surface"
     settings: RasterSettings
     perceptual: VggWeights | None = None  # the network of the term "perceptual"

@@ -182,6 +182,7 @@ TERMS: dict[str, Term] = {
         pose_prior=pose_terms.pose_prior,
         fingers_even=pose_terms.fingers_even,
         joint_axes=pose_terms.joint_axes,
+        finger_tendons=pose_terms.finger_tendons,
         depth_prior=pose_terms.depth_prior,
         betas_prior=pose_terms.betas_prior,
         object_prior=pose_terms.object_prior,

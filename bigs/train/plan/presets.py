@@ -25,13 +25,21 @@ _POSE_PRIORS = {
     "pose_prior": 1.0,
     "fingers_even": 0.3,
     "joint_axes": 12.0,
+    "finger_tendons": 0.6,
     "orient_prior": 0.1,
     "acceleration": 0.005,
 }
-# Grasps average over frames, so their estimates count more. The three priors on fingers keep their ratios:
-# those in which a regressor's errors (12 degrees), the unevenness of fingers, and turns about axes that a
-# joint does not have (4 degrees, since a model's axes are not exactly a hand's) usually are.
-_GRASP_PRIORS = {**_POSE_PRIORS, "pose_prior": 5.0, "fingers_even": 1.5, "joint_axes": 60.0}
+# Grasps average over frames, so their estimates count more. The four priors on fingers keep their ratios:
+# those in which a regressor's errors (12 degrees), the unevenness of fingers, turns about axes that a joint
+# does not have (4 degrees, since a model's axes are not exactly a hand's), and bends that tendons do not make
+# (8 degrees) usually are.
+_GRASP_PRIORS = {
+    **_POSE_PRIORS,
+    "pose_prior": 5.0,
+    "fingers_even": 1.5,
+    "joint_axes": 60.0,
+    "finger_tendons": 3.0,
+}
 
 # Hands that touch the object lie on its surface, and so do the fingers of a grasp; nothing lies inside.
 _TOUCH = {"contact": 0.1, "finger_contact": 0.1, "penetration": 0.01}
@@ -148,6 +156,7 @@ _PLAUSIBLE_TOGETHER = {
     "pose_prior": 0.2,
     "fingers_even": 0.06,
     "joint_axes": 2.4,
+    "finger_tendons": 0.12,
     "depth_prior": 12.0,
     "rigid": 0.03,
     **_TOUCH,

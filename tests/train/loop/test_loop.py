@@ -315,6 +315,16 @@ def test_fingers_that_twist_are_turned_back_on_both_hands(scene: Scene, evidence
         assert poses.pose[:, 0, 0].abs().max() < 0.2
 
 
+def test_the_ends_of_fingers_follow_their_tendons_on_both_hands(scene: Scene, evidence: Evidence) -> None:
+    with torch.no_grad():
+        for poses in scene.hand_poses.values():
+            poses.pose[:, 1, 2] = 0.9  # the middle joint of the index
+    stage = replace(ALONE, steps=40, lrs={"hand.pose": 0.05}, weights={"finger_tendons": 1.0})
+    losses: list[float] = []
+    run_stage(scene, stage, evidence, 0, after_step=lambda p, _: losses.append(p.loss))
+    assert losses[-1] < 0.1 * losses[0]
+
+
 def test_every_term_is_a_finite_number(scene: Scene, evidence: Evidence) -> None:
     """On an ordinary scene, each term alone can be asked for and can be differentiated."""
     evidence = replace(evidence, denoiser=LinearDenoiser(24, dtype=torch.float32))

@@ -68,7 +68,7 @@ def evidence(scene: Scene, *, flicker: float) -> Evidence:
     images = (0.5 + flicker * noise).expand(-1, -1, -1, 3).contiguous()
     shares = {"right": hand, "left": torch.zeros_like(hand), "object": 1.0 - hand}
     targets = Targets(images, shares, torch.zeros_like(hand), scene.K, 80, 60)
-    return Evidence(targets, {}, {}, {}, "surface", RasterSettings())
+    return Evidence(targets, {}, {}, {}, {}, "surface", RasterSettings())
 
 
 def cube_points(scene: Scene, *frames: int) -> MeasuredPoints:
