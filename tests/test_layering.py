@@ -76,7 +76,7 @@ MAY_IMPORT["train"] = {
 }
 MAY_IMPORT["bench"] = BELOW | {"bigs", "raster", "_raster"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT) - {"_raster"}
-MAY_IMPORT["cli"] = {"bigs", "types", "checks", "commands", "train", "bench", "preprocess"}
+MAY_IMPORT["cli"] = {"bigs", "types", "checks", "threads", "commands", "train", "bench", "preprocess"}
 
 # The same within the three largest packages: a folder or module may import itself and what its entry names.
 # Modules without an entry put the folders together and may import all of them.

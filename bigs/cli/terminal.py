@@ -111,14 +111,13 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def use_threads(threads: int) -> None:
-    """Limit both thread pools; the engine's reads its variable when it is first used."""
+    """Limit the threads of everything that follows; 0 does not."""
     if not 0 <= threads <= _MOST_THREADS:
         raise InputError(f"--threads: expected 0 to {_MOST_THREADS}, found {shown(threads)}")
     if threads:
-        os.environ["RAYON_NUM_THREADS"] = str(threads)
-        import torch
+        from bigs.threads import limit_threads
 
-        torch.set_num_threads(threads)
+        limit_threads(threads)
 
 
 def settings_of(

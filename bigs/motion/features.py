@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.colmap import pycolmap
-from bigs.threads import side_by_side
+from bigs.threads import side_by_side, thread_count
 
 # Margin of a crop in pixels, so that features at the object's border have their full patch.
 _MARGIN = 12
@@ -75,7 +75,7 @@ def extract_features(
     """
     boxes = [crop_box(mask) for mask in masks]
     scale = enlargement(boxes, config)
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False)
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=thread_count())
     options.sift.max_num_features = config.max_features
     options.sift.peak_threshold = config.peak_threshold
     options.sift.first_octave = config.first_octave

@@ -12,6 +12,7 @@ import numpy as np
 
 from bigs.colmap import pycolmap
 from bigs.motion.features import FrameFeatures, quiet_colmap
+from bigs.threads import thread_count
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def match_features(
         names.write_text("".join(f"{a:06d}.png {b:06d}.png\n" for a, b in pairs))
         pycolmap.match_image_pairs(
             file,
-            matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+            matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=thread_count()),
             pairing_options=pycolmap.ImportedPairingOptions(match_list_path=names),
             verification_options=_verification(config),
             device=pycolmap.Device.cpu,
@@ -188,7 +189,7 @@ def _match(file: Path, config: MappingConfig, candidates: dict[tuple[int, int], 
     if candidates is not None:
         _verify(file, candidates, verification)
         return
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=thread_count())
     device = pycolmap.Device.cpu
     if config.pairs == "exhaustive":
         pycolmap.match_exhaustive(
@@ -238,6 +239,7 @@ def _pipeline_options(known_focal: bool, config: MappingConfig) -> pycolmap.Incr
     options = pycolmap.IncrementalPipelineOptions(
         min_model_size=config.min_model_size,
         extract_colors=False,
+        num_threads=thread_count(),
         random_seed=config.seed,
         ba_refine_focal_length=not known_focal,
         ba_refine_principal_point=False,

@@ -11,13 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
-
 from bigs.checks import InputError
 from bigs.commands.folder.contents import CONFIG, SCENE, read_scores, write_json
 from bigs.commands.run.reconstruct import reconstruct
 from bigs.commands.run.series import PlannedRun
 from bigs.files import read_json
+from bigs.threads import limit_threads
 
 STATUS = "status.json"
 JOB_LOG = "batch.log"
@@ -106,7 +105,7 @@ def run_job(job: Job) -> None:
         say(f"attempt {status.attempts} on {status.host}, process {status.pid}")
         error, again = "", False
         try:
-            _limit_threads(job.threads)
+            limit_threads(job.threads)
             reconstruct(
                 job.run.clip,
                 folder,
@@ -129,9 +128,3 @@ def run_job(job: Job) -> None:
     else:
         scores = read_scores(folder).get("result", {})
         write_status(folder, Status(**done | {"state": "finished", "scores": scores}))
-
-
-def _limit_threads(threads: int) -> None:
-    # The engine reads this variable on first use in a process.
-    os.environ["RAYON_NUM_THREADS"] = str(threads)
-    torch.set_num_threads(threads)
