@@ -75,7 +75,7 @@ class Inline:
 def clips(monkeypatch: pytest.MonkeyPatch) -> Clips:
     fake = Clips()
     monkeypatch.setattr("bigs.commands.batch.job.reconstruct", fake)
-    monkeypatch.setattr("bigs.commands.batch.job._limit_threads", lambda threads: None)
+    monkeypatch.setattr("bigs.commands.batch.job.limit_threads", lambda threads: None)
     return fake
 
 
