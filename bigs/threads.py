@@ -14,7 +14,7 @@ R = TypeVar("R")
 
 
 def limit_threads(threads: int) -> None:
-    """Limit the pools of torch and of the engine, which reads its variable when it is first used."""
+    """Limit torch, what counts on `thread_count`, and the engine, which reads its variable on first use."""
     os.environ["RAYON_NUM_THREADS"] = str(threads)
     torch.set_num_threads(threads)
 

@@ -95,7 +95,7 @@ def map_features(
         matches = _verified_matches(file)
         (Path(folder) / "models").mkdir()
         found = pycolmap.incremental_mapping(
-            file, folder, Path(folder) / "models", _pipeline_options(known_focal, config)
+            file, folder, Path(folder) / "models", options=_pipeline_options(known_focal, config)
         )
         models, focals = [], []
         for reconstruction in found.values():
