@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bigs.raster.settings import RasterSettings
 
 __all__ = [
+    "BundleSightings",
     "RasterState",
     "SymmetryJudge",
     "TouchState",
@@ -320,6 +321,65 @@ class NearestPoints:
         self, places: NDArray[np.float64], guesses: NDArray[np.uint32] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """Distance and index of the point that is nearest to each place; guesses of the indices save time."""
+
+_Scene = tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], tuple[float, float, float, float]
+]
+_System = tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]
+
+@final
+class BundleSightings:
+    """What was seen where, for bundle adjustment of T frames, of which F may move, and P points. Opaque.
+
+    A scene is rotations [T, 9], transl [T, 3], points [P, 3] by rank, and fx, fy, cx, cy. A coupling of an
+    observation's point with its pose has 12 numbers. `sigma` is the scale of Cauchy's loss in pixels.
+    """
+
+    def __new__(
+        cls,
+        frame: NDArray[np.int64],
+        point: NDArray[np.int64],
+        pixels: NDArray[np.float64],
+        precision: NDArray[np.float64],
+        free: NDArray[np.bool_],
+    ) -> BundleSightings:
+        """Observations by rank of their point and then by frame; `free` [T] says which frames may move."""
+
+    def cost(self, scene: _Scene, sigma: float) -> float:
+        """The sum of Cauchy's losses."""
+
+    def linearise(self, scene: _Scene, sigma: float) -> _System:
+        """Normal equations, flat: poses, their gradient, points, their gradient, couplings."""
+
+    def border(
+        self, scene: _Scene, sigma: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+        """The focal length's part of them: with the poses, with the points, second and first derivative."""
+
+    def reduce(
+        self, system: _System, damping: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The poses' equations without the points, and the inverses of the points' matrices, flat."""
+
+    def point_steps(
+        self,
+        couplings: NDArray[np.float64],
+        point_gradient: NDArray[np.float64],
+        inverses: NDArray[np.float64],
+        change: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """How far points go when the poses go by `change` [F, 6], flat."""
+
+    def carried(
+        self, couplings: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """What values [P, 3] of the points do in the poses' equations [6F]."""
 
 @final
 class SymmetryJudge:

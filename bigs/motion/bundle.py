@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from bigs.motion.schur import (
     Observations,
+    Scene,
     System,
+    cost_of_pixels,
     linearise,
     point_steps,
     pose_steps,
@@ -179,6 +181,12 @@ def make_problem(
     return Problem(seen, free, K, config, anchor)
 
 
+def scene_of(problem: Problem, bundle: Bundle) -> Scene:
+    """Where `bundle` has everything, its points by rank."""
+    points = bundle.points[problem.seen.points]
+    return Scene(bundle.rotations, bundle.transl, points, problem.K, problem.config.pixel_sigma)
+
+
 def _in_camera(bundle: Bundle) -> np.ndarray:
     points = bundle.points[bundle.point]
     return np.einsum("mij,mj->mi", bundle.rotations[bundle.frame], points) + bundle.transl[bundle.frame]
@@ -189,13 +197,11 @@ def _project(cam: np.ndarray, K: np.ndarray) -> np.ndarray:
     return cam[:, :2] / depth[:, None] * (K[0, 0], K[1, 1]) + K[:2, 2]
 
 
-def _cauchy(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Loss and weight of squared norms in units of their scale."""
-    return np.log1p(squared), 1.0 / (1.0 + squared)
-
-
 def _soft(squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same for a loss that grows like the norm itself: a real change of motion costs, but is not free."""
+    """Loss and weight of squared norms in units of their scale.
+
+    The loss grows like the norm itself: a real change of motion costs, but is not free.
+    """
     root = np.sqrt(1.0 + squared)
     return 2.0 * (root - 1.0), 1.0 / root
 
@@ -209,9 +215,9 @@ def _leaving(squared: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]
 def cost_of(problem: Problem, bundle: Bundle) -> float:
     """The sum of all losses, twice the negative logarithm of a likelihood."""
     config = problem.config
-    pixel, _ = _cauchy(bundle.misfits(problem.K) / config.pixel_sigma**2)
+    pixels = cost_of_pixels(problem.seen, scene_of(problem, bundle))
     turn, shift = _accelerations(bundle, config)
-    total = pixel.sum() + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
+    total = pixels + _soft((turn**2).sum(1))[0].sum() + _soft((shift**2).sum(1))[0].sum()
     if problem.anchor is not None:
         for values in _departures(bundle, problem.anchor):
             total += problem.anchor.trust @ _leaving((values**2).sum(1), config.anchor_outlier)[0]
@@ -238,15 +244,7 @@ def _accelerations(bundle: Bundle, config: BundleConfig) -> tuple[np.ndarray, np
 def linearise_all(problem: Problem, bundle: Bundle) -> System:
     """Normal equations about `bundle`, the motion prior's part included."""
     frames = int(problem.free.sum())
-    system = linearise(
-        problem.seen,
-        bundle.rotations,
-        bundle.transl,
-        bundle.points[problem.seen.points],
-        problem.K,
-        problem.config.pixel_sigma,
-        frames,
-    )
+    system = linearise(problem.seen, scene_of(problem, bundle))
     poses, gradient = system.poses.reshape(frames, 6, frames, 6), system.pose_gradient.reshape(frames, 6)
     _add_motion_prior(poses, gradient, bundle, problem)
     if problem.anchor is not None:

@@ -14,8 +14,8 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from bigs.motion.bundle import Bundle, BundleConfig, Problem, cost_of, linearise_all, make_problem
-from bigs.motion.schur import Observations, Reduced, System, point_steps, pulled, reduce
+from bigs.motion.bundle import Bundle, BundleConfig, cost_of, linearise_all, make_problem, scene_of
+from bigs.motion.schur import Border, Observations, System, carried, focal_border, point_steps, reduce
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
     cost = cost_of(problem, bundle)
     for _ in range(config.iterations):
         system = linearise_all(problem, bundle)
-        border = _border(problem, bundle)
+        border = focal_border(problem.seen, scene_of(problem, bundle))
         for _ in range(6):
             step = _step(system, problem.seen, border, damping)
             if not step.stiffness > 0.0:
@@ -121,15 +121,6 @@ def scaled_focal(K: np.ndarray, factor: float) -> np.ndarray:
     return changed
 
 
-class _Border(NamedTuple):
-    """The focal length's part of the normal equations, for the logarithm of a factor on it."""
-
-    poses: np.ndarray  # [6T] its coupling with the poses
-    points: np.ndarray  # [P, 3] with the points, by rank
-    stiffness: float
-    gradient: float
-
-
 class _Step(NamedTuple):
     poses: np.ndarray  # [T, 6]
     points: np.ndarray  # [P, 3] by rank
@@ -137,62 +128,21 @@ class _Step(NamedTuple):
     stiffness: float  # second derivative of the cost by it, everything else following
 
 
-def _border(problem: Problem, bundle: Bundle) -> _Border:
-    seen, K, sigma = problem.seen, problem.K, problem.config.pixel_sigma
-    rotation = bundle.rotations[seen.frame]
-    arm = np.einsum("mij,mj->mi", rotation, bundle.points[seen.points][seen.point])
-    place = arm + bundle.transl[seen.frame]
-    depth = np.where(place[:, 2] > 1e-6, place[:, 2], 1e-6)[:, None]
-    ray = place[:, :2] / depth
-    focal = K[[0, 1], [0, 1]]
-    grown = focal * ray  # derivative of the pixel
-    off = grown + K[:2, 2] - seen.pixels.T
-    (xx, xy, yy), off_pull = pulled(seen.precision, off.T, sigma)
-    # Of the pixel's derivatives by the focal length and by its place.
-    held = np.stack([xx * grown[:, 0] + xy * grown[:, 1], xy * grown[:, 0] + yy * grown[:, 1]], axis=1)
-    across = focal / depth * held
-    pull = np.concatenate([across, -(ray * across).sum(1, keepdims=True)], axis=1)  # by the place
-    starts = np.concatenate([batch.starts + batch.rows.start for batch in seen.batches])
-    by_pose = np.concatenate([np.cross(arm, pull), pull], axis=1)
-    frames = len(bundle.rotations)
-    return _Border(
-        np.stack([np.bincount(seen.frame, by_pose[:, i], frames) for i in range(6)], axis=1).ravel(),
-        np.add.reduceat(np.einsum("mji,mj->mi", rotation, pull), starts, axis=0),
-        float((grown * held).sum()),
-        float((grown * np.transpose(off_pull)).sum()),
-    )
-
-
-def _step(system: System, seen: Observations, border: _Border, damping: float) -> _Step:
+def _step(system: System, seen: Observations, border: Border, damping: float) -> _Step:
     """A damped step of everything: points eliminated first, then poses, then the focal length."""
     reduced = reduce(system, seen, damping)
-    column, stiffness, gradient = border.poses.copy(), border.stiffness, border.gradient
-    for batch, part, inverse in zip(seen.batches, system.parts, reduced.inverses, strict=True):
-        own = border.points[batch.points]
-        held = np.einsum("nij,nj->ni", inverse, own)
-        stiffness -= float((held * own).sum())
-        gradient -= float((held * part.gradient).sum())
-        slots = 6 * batch.slots[batch.pair_slot]
-        for i in range(6):
-            values = (part.coupling[i] * held[batch.pair_point].T).sum(0)
-            column -= np.bincount(slots + i, values, len(column))
+    held = np.einsum("nij,nj->ni", reduced.inverses, border.points)
+    stiffness = border.stiffness - float((held * border.points).sum())
+    gradient = border.gradient - float((held * system.point_gradient).sum())
+    column = border.poses - carried(system, seen, held)
     poses, follows = scipy.linalg.solve(
         reduced.matrix, np.stack([-reduced.gradient, -column], axis=1), assume_a="sym"
     ).T
     stiffness += float(column @ follows)
     growth = -(gradient + float(column @ poses)) / stiffness if stiffness > 0.0 else 0.0
     change = (poses + growth * follows).reshape(-1, 6)
-    return _Step(change, _points_following(system, seen, reduced, border, change, growth), growth, stiffness)
-
-
-def _points_following(
-    system: System, seen: Observations, reduced: Reduced, border: _Border, change: np.ndarray, growth: float
-) -> np.ndarray:
-    pulled = [
-        part._replace(gradient=part.gradient + growth * border.points[batch.points])
-        for batch, part in zip(seen.batches, system.parts, strict=True)
-    ]
-    return point_steps(system._replace(parts=pulled), reduced, seen, change)
+    pulled = system._replace(point_gradient=system.point_gradient + growth * border.points)
+    return _Step(change, point_steps(pulled, reduced, seen, change), growth, stiffness)
 
 
 def _thinned(bundle: Bundle, most: int) -> Bundle:

@@ -1,5 +1,6 @@
 //! `bigs._raster`: the Python face of `bigs-raster`. Arrays in, arrays out; no algorithm, default or limit lives here.
 
+mod bundle;
 mod call;
 mod convert;
 mod hand_poses;
@@ -340,6 +341,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(pixels::terms_alone_backward, m)?)?;
     m.add_function(wrap_pyfunction!(track::cut_patches, m)?)?;
     m.add_function(wrap_pyfunction!(track::lay_patches, m)?)?;
+    m.add_class::<bundle::BundleSightings>()?;
     m.add_class::<shape::SymmetryJudge>()?;
     m.add_class::<shape::NearestPoints>()?;
     m.add_function(wrap_pyfunction!(shape::cone_distances, m)?)?;

@@ -32,7 +32,7 @@ impl<'py> Planes<'py> {
     }
 }
 
-fn refused(error: TrackError) -> PyErr {
+pub(crate) fn refused(error: TrackError) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 

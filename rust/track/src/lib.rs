@@ -18,12 +18,14 @@
     )
 )]
 
+mod bundle;
 mod cut;
 mod error;
 mod lay;
 mod picture;
 mod sums;
 
+pub use bundle::{Border, Equations, Reduced, Scene, Sightings, System};
 pub use cut::{Cut, Templates, cut};
 pub use error::TrackError;
 pub use lay::{Laid, Laying, lay};

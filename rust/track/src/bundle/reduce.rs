@@ -1,0 +1,197 @@
+//! The points eliminated from the normal equations.
+//!
+//! A point that F frames see couples all of them: its part of the poses' equations has 36 F² numbers. Points are taken
+//! in rounds that fit into the cache. Within a round each band of frames has a dense block for every point that it saw,
+//! and each pair of bands multiplies the blocks of the points that both saw.
+
+use bigs_raster::SimdLevel;
+use rayon::prelude::*;
+
+use crate::TrackError;
+use crate::bundle::Sightings;
+use crate::bundle::band::{FRAMES, Seen, UNKNOWNS};
+use crate::bundle::glance::cross;
+use crate::bundle::linearise::Coupling;
+use crate::bundle::points::{Inverse, onto_pose, times};
+use crate::bundle::sightings::STILL;
+use crate::bundle::tile::{Block, EMPTY, Pairs, Panel, Tile};
+
+/// Normal equations as [`Sightings::linearise`] makes them, perhaps with more added to those of the poses.
+#[derive(Clone, Copy, Debug)]
+pub struct Equations<'a> {
+    /// 6F × 6F, symmetric.
+    pub poses: &'a [f64],
+    /// 6F.
+    pub pose_gradient: &'a [f64],
+    /// P, row by row.
+    pub points: &'a [[f64; 9]],
+    /// P.
+    pub point_gradient: &'a [[f64; 3]],
+    /// One for each observation.
+    pub couplings: &'a [[f64; 12]],
+}
+
+/// The poses' equations without the points.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Reduced {
+    /// 6F × 6F.
+    pub matrix: Vec<f64>,
+    /// 6F.
+    pub gradient: Vec<f64>,
+    /// P, row by row: inverses of the points' damped matrices. One that has none is 0.
+    pub inverses: Vec<[f64; 9]>,
+}
+
+impl Sightings {
+    /// Eliminate the points, after Levenberg's and Marquardt's `damping` of all equations.
+    ///
+    /// # Errors
+    ///
+    /// Equations of another number of unknowns or observations, or a level of vectors that this machine does not have.
+    pub fn reduce(&self, equations: &Equations<'_>, damping: f64) -> Result<Reduced, TrackError> {
+        let unknowns = 6 * self.moving;
+        for (what, expected, found) in [
+            ("poses", unknowns * unknowns, equations.poses.len()),
+            ("pose_gradient", unknowns, equations.pose_gradient.len()),
+            ("points", self.points(), equations.points.len()),
+            ("point_gradient", self.points(), equations.point_gradient.len()),
+            ("couplings", self.count(), equations.couplings.len()),
+        ] {
+            TrackError::check_length(what, expected, found)?;
+        }
+        let level = SimdLevel::chosen().map_err(|error| TrackError::level(&error))?;
+        let inverses: Vec<Inverse> = equations
+            .points
+            .par_iter()
+            .map(|matrix| Inverse::damped(matrix, damping))
+            .collect();
+        let held: Vec<[f64; 3]> = inverses
+            .par_iter()
+            .zip(equations.point_gradient)
+            .map(|(inverse, gradient)| times(&inverse.whole, *gradient))
+            .collect();
+        let eliminated = self.eliminated(level, equations.couplings, &inverses, &held);
+        let mut reduced = Reduced {
+            matrix: equations.poses.to_vec(),
+            gradient: equations.pose_gradient.to_vec(),
+            inverses: inverses.iter().map(|inverse| inverse.whole).collect(),
+        };
+        for (value, own) in reduced
+            .gradient
+            .iter_mut()
+            .zip(eliminated.gradient.as_flattened())
+        {
+            *value -= own;
+        }
+        reduced
+            .matrix
+            .par_chunks_exact_mut(unknowns.max(1))
+            .enumerate()
+            .for_each(|(i, row)| {
+                row[i] = row[i] * (1.0 + damping) + 1e-9;
+                for (j, value) in row.iter_mut().enumerate() {
+                    *value -= eliminated.at(i.max(j), i.min(j));
+                }
+            });
+        Ok(reduced)
+    }
+
+    /// What the points' share of the poses' equations is, given inverses, and these times the gradient.
+    fn eliminated(
+        &self,
+        level: SimdLevel,
+        couplings: &[Coupling],
+        inverses: &[Inverse],
+        held: &[[f64; 3]],
+    ) -> Eliminated {
+        let bands = self.bands.count();
+        let mut gradient = vec![[0.0; UNKNOWNS]; bands];
+        let mut blocks: Vec<Vec<Block>> = vec![vec![]; bands];
+        // Later bands by earlier ones, and themselves.
+        let mut tiles: Vec<(usize, usize, Tile)> = (0..bands)
+            .flat_map(|i| (0..=i).map(move |j| (i, j, Tile::zero())))
+            .collect();
+        for round in self.bands.rounds() {
+            (&mut blocks, &mut gradient, &round)
+                .into_par_iter()
+                .for_each(|(blocks, gradient, seen)| {
+                    blocks.clear();
+                    blocks.extend(seen.iter().map(|seen| {
+                        let (rows, own) = (seen.rows.map(|row| row as usize), seen.point as usize);
+                        let mut block = EMPTY;
+                        for row in rows[0]..rows[1] {
+                            let slot = self.slots[self.frame[row] as usize];
+                            if slot != STILL {
+                                let at = 6 * (slot as usize % FRAMES);
+                                block.add(&couplings[row], &inverses[own].root, at);
+                                let pull = onto_pose(&couplings[row], held[own]);
+                                for i in 0..6 {
+                                    gradient[at + i] += pull[i];
+                                }
+                            }
+                        }
+                        block
+                    }));
+                });
+            tiles
+                .par_iter_mut()
+                .for_each_init(Pairs::default, |pairs, (i, j, tile)| {
+                    tile.add(
+                        level,
+                        panel(&round, &blocks, *i),
+                        panel(&round, &blocks, *j),
+                        pairs,
+                    );
+                });
+        }
+        Eliminated {
+            tiles: tiles.into_iter().map(|(_, _, tile)| tile).collect(),
+            gradient,
+        }
+    }
+}
+
+fn panel<'a>(round: &[&'a [Seen]], blocks: &'a [Vec<Block>], band: usize) -> Panel<'a> {
+    Panel {
+        seen: round[band],
+        blocks: &blocks[band],
+    }
+}
+
+impl Block {
+    /// Add a coupling times the transposed root of the point's inverse, for the pose whose unknowns begin at `at`.
+    #[inline(always)]
+    fn add(&mut self, coupling: &Coupling, [a, b, c, d, e, f]: &[f64; 6], at: usize) {
+        let &[ax, ay, az, ref rows @ ..] = coupling;
+        let mut scaled = [[0.0; 3]; 3];
+        for i in 0..3 {
+            let [x, y, z] = [rows[3 * i], rows[3 * i + 1], rows[3 * i + 2]];
+            scaled[0][i] = a * x;
+            scaled[1][i] = b * x + c * y;
+            scaled[2][i] = d * x + e * y + f * z;
+        }
+        for (row, shift) in self.0.iter_mut().zip(scaled) {
+            let turn = cross([ax, ay, az], shift);
+            for i in 0..3 {
+                row[at + i] += turn[i];
+                row[at + 3 + i] += shift[i];
+            }
+        }
+    }
+}
+
+/// What elimination takes from the poses' equations, by bands.
+struct Eliminated {
+    /// Those of band i and j ≤ i, i by i.
+    tiles: Vec<Tile>,
+    gradient: Vec<[f64; UNKNOWNS]>,
+}
+
+impl Eliminated {
+    /// The number in row i and column j ≤ i.
+    #[inline(always)]
+    fn at(&self, i: usize, j: usize) -> f64 {
+        let (band, other) = (i / UNKNOWNS, j / UNKNOWNS);
+        self.tiles[band * (band + 1) / 2 + other].0[i % UNKNOWNS][j % UNKNOWNS]
+    }
+}
