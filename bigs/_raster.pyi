@@ -376,9 +376,7 @@ class BundleSightings:
     ) -> NDArray[np.float64]:
         """How far points go when the poses go by `change` [F, 6], flat."""
 
-    def carried(
-        self, couplings: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def carried(self, couplings: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """What values [P, 3] of the points do in the poses' equations [6F]."""
 
 @final

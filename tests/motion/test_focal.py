@@ -46,12 +46,10 @@ def test_the_error_told_is_the_error_made() -> None:
     assert 0.3 * np.mean(told) < usual < 2.0 * np.mean(told)
 
 
-def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_step_is_that_of_the_dense_equations() -> None:
     """One step from a start that is off, against the normal equations of finite differences."""
     import bigs.motion.focal as focal
-    import bigs.motion.schur as schur
 
-    monkeypatch.setattr(schur, "_BATCH", 200)
     whole = seen_through(1.0, 0.3, frames=6)
     roots = np.random.default_rng(1).normal(0.0, 0.4, (len(whole.frame), 2, 2)) + np.eye(2)
     bundle = focal._thinned(
@@ -61,9 +59,8 @@ def test_the_step_is_that_of_the_dense_equations(monkeypatch: pytest.MonkeyPatch
     assert 80 < len(bundle.frame) <= 150
     scales = replace(SCALES, pixel_sigma=0.5, turn_sigma=1e4, shift_sigma=1e3)  # no prior to speak of
     problem = focal.make_problem(bundle, K, scales, np.ones(6, dtype=bool), None)
-    step = focal._step(
-        focal.linearise_all(problem, bundle), problem.seen, focal._border(problem, bundle), 1e-2
-    )
+    border = focal.focal_border(problem.seen, focal.scene_of(problem, bundle))
+    step = focal._step(focal.linearise_all(problem, bundle), problem.seen, border, 1e-2)
 
     def whitened(there: Bundle, K: np.ndarray) -> np.ndarray:
         return np.einsum("mji,mj->mi", root, there.residuals(K))

@@ -335,6 +335,8 @@ fn many_pieces_and_rounds_are_the_sum_of_their_parts() {
     let whole = everything(&world);
     let mut matrix = vec![0.0; whole.1.poses.len()];
     let mut gradient = vec![0.0; whole.1.pose_gradient.len()];
+    // What points carry to the poses, and the focal length's coupling with these.
+    let mut carried = vec![0.0; 2 * gradient.len()];
     for first in (0..2500).step_by(250) {
         let own = |point: &i64| (first..first + 250).contains(&(*point as usize));
         let rows: Vec<usize> = (0..world.point.len())
@@ -348,11 +350,14 @@ fn many_pieces_and_rounds_are_the_sum_of_their_parts() {
             precision: rows.iter().map(|&row| world.precision[row]).collect(),
             ..world.clone()
         };
-        let (_, system, reduced, ..) = everything(&part);
+        let (_, system, reduced, _, numbers) = everything(&part);
         for (sum, value) in matrix.iter_mut().zip(&reduced.matrix) {
             *sum += value;
         }
         for (sum, value) in gradient.iter_mut().zip(&reduced.gradient) {
+            *sum += value;
+        }
+        for (sum, value) in carried.iter_mut().zip(&numbers) {
             *sum += value;
         }
         assert!(
@@ -362,6 +367,7 @@ fn many_pieces_and_rounds_are_the_sum_of_their_parts() {
     }
     assert_near(&whole.2.matrix, &matrix, 1e-10);
     assert_near(&whole.2.gradient, &gradient, 1e-10);
+    assert_near(&whole.4[..carried.len()], &carried, 1e-10);
 }
 
 #[test]
