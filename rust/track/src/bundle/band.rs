@@ -9,7 +9,7 @@ pub(crate) const FRAMES: usize = 4;
 pub(crate) const UNKNOWNS: usize = 6 * FRAMES;
 
 /// A round is as many points as have this many blocks, which the cache holds.
-const BLOCKS: usize = 4096;
+const BLOCKS: usize = 2048;
 
 /// A point that a band saw.
 #[derive(Clone, Copy, Debug)]

@@ -55,16 +55,22 @@ impl Inverse {
             whole: [i00, i10, i20, i10, i11, i21, i20, i21, i22],
         }
     }
+
+    /// Product of the root and a vector.
+    pub(crate) fn root_times(&self, [x, y, z]: [f64; 3]) -> [f64; 3] {
+        let [a, b, c, d, e, f] = self.root;
+        [a * x, b * x + c * y, d * x + e * y + f * z]
+    }
 }
 
 /// Product of a matrix and a vector.
-pub(crate) fn times(matrix: &[f64; 9], [x, y, z]: [f64; 3]) -> [f64; 3] {
+fn times(matrix: &[f64; 9], [x, y, z]: [f64; 3]) -> [f64; 3] {
     [0, 3, 6].map(|row| matrix[row] * x + matrix[row + 1] * y + matrix[row + 2] * z)
 }
 
 /// What a coupling makes of a point's vector in the pose's equations: turn, then shift.
 #[inline(always)]
-pub(crate) fn onto_pose(coupling: &Coupling, [x, y, z]: [f64; 3]) -> [f64; 6] {
+fn onto_pose(coupling: &Coupling, [x, y, z]: [f64; 3]) -> [f64; 6] {
     let &[ax, ay, az, ref rows @ ..] = coupling;
     let shift = [0, 3, 6].map(|row| rows[row] * x + rows[row + 1] * y + rows[row + 2] * z);
     let turn = cross([ax, ay, az], shift);

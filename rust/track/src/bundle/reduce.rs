@@ -4,7 +4,7 @@
 //! in rounds that fit into the cache. Within a round each band of frames has a dense block for every point that it saw,
 //! and each pair of bands multiplies the blocks of the points that both saw.
 
-use bigs_raster::SimdLevel;
+use bigs_raster::{Simd, SimdLevel, Work};
 use rayon::prelude::*;
 
 use crate::TrackError;
@@ -12,9 +12,9 @@ use crate::bundle::Sightings;
 use crate::bundle::band::{FRAMES, Seen, UNKNOWNS};
 use crate::bundle::glance::cross;
 use crate::bundle::linearise::Coupling;
-use crate::bundle::points::{Inverse, onto_pose, times};
+use crate::bundle::points::Inverse;
 use crate::bundle::sightings::STILL;
-use crate::bundle::tile::{Block, EMPTY, Pairs, Panel, Tile};
+use crate::bundle::tile::{Block, EMPTY, Pairs, Panel, Tile, level};
 
 /// Normal equations as [`Sightings::linearise`] makes them, perhaps with more added to those of the poses.
 #[derive(Clone, Copy, Debug)]
@@ -59,7 +59,7 @@ impl Sightings {
         ] {
             TrackError::check_length(what, expected, found)?;
         }
-        let level = SimdLevel::chosen().map_err(|error| TrackError::level(&error))?;
+        let level = level()?;
         let inverses: Vec<Inverse> = equations
             .points
             .par_iter()
@@ -68,7 +68,7 @@ impl Sightings {
         let held: Vec<[f64; 3]> = inverses
             .par_iter()
             .zip(equations.point_gradient)
-            .map(|(inverse, gradient)| times(&inverse.whole, *gradient))
+            .map(|(inverse, gradient)| inverse.root_times(*gradient))
             .collect();
         let eliminated = self.eliminated(level, equations.couplings, &inverses, &held);
         let mut reduced = Reduced {
@@ -96,7 +96,7 @@ impl Sightings {
         Ok(reduced)
     }
 
-    /// What the points' share of the poses' equations is, given inverses, and these times the gradient.
+    /// What the points' share of the poses' equations is, given inverses, and their roots times the gradient.
     fn eliminated(
         &self,
         level: SimdLevel,
@@ -114,24 +114,17 @@ impl Sightings {
         for round in self.bands.rounds() {
             (&mut blocks, &mut gradient, &round)
                 .into_par_iter()
-                .for_each(|(blocks, gradient, seen)| {
-                    blocks.clear();
-                    blocks.extend(seen.iter().map(|seen| {
-                        let (rows, own) = (seen.rows.map(|row| row as usize), seen.point as usize);
-                        let mut block = EMPTY;
-                        for row in rows[0]..rows[1] {
-                            let slot = self.slots[self.frame[row] as usize];
-                            if slot != STILL {
-                                let at = 6 * (slot as usize % FRAMES);
-                                block.add(&couplings[row], &inverses[own].root, at);
-                                let pull = onto_pose(&couplings[row], held[own]);
-                                for i in 0..6 {
-                                    gradient[at + i] += pull[i];
-                                }
-                            }
-                        }
-                        block
-                    }));
+                .for_each(|(blocks, gradient, &round)| {
+                    blocks.resize(round.len(), EMPTY);
+                    level.run(Scaling {
+                        seen: self,
+                        round,
+                        couplings,
+                        inverses,
+                        held,
+                        blocks,
+                        gradient,
+                    });
                 });
             tiles
                 .par_iter_mut()
@@ -158,6 +151,41 @@ fn panel<'a>(round: &[&'a [Seen]], blocks: &'a [Vec<Block>], band: usize) -> Pan
     }
 }
 
+/// A band's blocks of a round, and what is taken from the gradient of its poses.
+struct Scaling<'a> {
+    seen: &'a Sightings,
+    round: &'a [Seen],
+    couplings: &'a [Coupling],
+    inverses: &'a [Inverse],
+    held: &'a [[f64; 3]],
+    blocks: &'a mut [Block],
+    gradient: &'a mut [f64; UNKNOWNS],
+}
+
+impl Work for Scaling<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        for (own, block) in self.round.iter().zip(self.blocks) {
+            let (point, rows) = (own.point as usize, own.rows.map(|row| row as usize));
+            *block = EMPTY;
+            for row in rows[0]..rows[1] {
+                let slot = self.seen.slots[self.seen.frame[row] as usize];
+                if slot != STILL {
+                    let at = 6 * (slot as usize % FRAMES);
+                    block.add(&self.couplings[row], &self.inverses[point].root, at);
+                }
+            }
+            for (row, held) in block.0.iter().zip(self.held[point]) {
+                for (sum, value) in self.gradient.iter_mut().zip(row) {
+                    *sum += value * held;
+                }
+            }
+        }
+    }
+}
+
 impl Block {
     /// Add a coupling times the transposed root of the point's inverse, for the pose whose unknowns begin at `at`.
     #[inline(always)]
@@ -172,9 +200,10 @@ impl Block {
         }
         for (row, shift) in self.0.iter_mut().zip(scaled) {
             let turn = cross([ax, ay, az], shift);
+            let own = &mut row[at..at + 6];
             for i in 0..3 {
-                row[at + i] += turn[i];
-                row[at + 3 + i] += shift[i];
+                own[i] += turn[i];
+                own[3 + i] += shift[i];
             }
         }
     }
