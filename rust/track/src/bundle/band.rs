@@ -8,8 +8,10 @@ use crate::bundle::sightings::STILL;
 pub(crate) const FRAMES: usize = 4;
 pub(crate) const UNKNOWNS: usize = 6 * FRAMES;
 
-/// A round is as many points as have this many blocks, which the cache holds.
+/// A round is as many points as have this many blocks, which the cache holds, and for each band so many, since a round
+/// adds to all pairs of bands.
 const BLOCKS: usize = 2048;
+const BLOCKS_PER_BAND: usize = 64;
 
 /// A point that a band saw.
 #[derive(Clone, Copy, Debug)]
@@ -36,6 +38,7 @@ impl Bands {
         let mut seen: Vec<Vec<Seen>> = vec![vec![]; moving.div_ceil(FRAMES)];
         let mut rounds = vec![];
         let mut ends: Vec<usize> = vec![0; seen.len()];
+        let most = BLOCKS.max(BLOCKS_PER_BAND * seen.len());
         let mut blocks = 0;
         for point in 0..starts.len() - 1 {
             for row in starts[point]..starts[point + 1] {
@@ -60,7 +63,7 @@ impl Bands {
                     }
                 }
             }
-            if blocks >= BLOCKS || point + 2 == starts.len() {
+            if blocks >= most || point + 2 == starts.len() {
                 rounds.push(
                     seen.iter()
                         .zip(&mut ends)

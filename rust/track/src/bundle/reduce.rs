@@ -14,7 +14,7 @@ use crate::bundle::glance::cross;
 use crate::bundle::linearise::Coupling;
 use crate::bundle::points::Inverse;
 use crate::bundle::sightings::STILL;
-use crate::bundle::tile::{Block, EMPTY, Pairs, Panel, Tile, level};
+use crate::bundle::tile::{Block, EMPTY, Pairs, Panel, Tile};
 
 /// Normal equations as [`Sightings::linearise`] makes them, perhaps with more added to those of the poses.
 #[derive(Clone, Copy, Debug)]
@@ -59,7 +59,7 @@ impl Sightings {
         ] {
             TrackError::check_length(what, expected, found)?;
         }
-        let level = level()?;
+        let level = SimdLevel::chosen().map_err(|error| TrackError::level(&error))?;
         let inverses: Vec<Inverse> = equations
             .points
             .par_iter()

@@ -2,7 +2,6 @@
 
 use bigs_raster::{Simd, SimdLevel, Vector, Work};
 
-use crate::TrackError;
 use crate::bundle::band::{FRAMES, Seen, UNKNOWNS};
 
 /// Pairs of blocks that are multiplied while they stay in the nearest cache.
@@ -32,11 +31,6 @@ pub(crate) struct Tile(pub(crate) [[f64; UNKNOWNS]; UNKNOWNS]);
 pub(crate) struct Pairs {
     all: Vec<[u32; 2]>,
     own: Vec<[u32; 2]>,
-}
-
-/// The vectors of this machine.
-pub(crate) fn level() -> Result<SimdLevel, TrackError> {
-    SimdLevel::chosen().map_err(|error| TrackError::level(&error))
 }
 
 impl Tile {
