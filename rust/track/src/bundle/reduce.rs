@@ -72,9 +72,9 @@ impl Sightings {
             .collect();
         let eliminated = self.eliminated(level, equations.couplings, &inverses, &held);
         let mut reduced = Reduced {
-            matrix: equations.poses.to_vec(),
+            matrix: vec![0.0; unknowns * unknowns],
             gradient: equations.pose_gradient.to_vec(),
-            inverses: inverses.iter().map(|inverse| inverse.whole).collect(),
+            inverses: inverses.par_iter().map(|inverse| inverse.whole).collect(),
         };
         for (value, own) in reduced
             .gradient
@@ -83,15 +83,16 @@ impl Sightings {
         {
             *value -= own;
         }
+        let width = unknowns.max(1);
         reduced
             .matrix
-            .par_chunks_exact_mut(unknowns.max(1))
+            .par_chunks_exact_mut(width)
+            .zip(equations.poses.par_chunks_exact(width))
             .enumerate()
-            .for_each(|(i, row)| {
-                row[i] = row[i] * (1.0 + damping) + 1e-9;
-                for (j, value) in row.iter_mut().enumerate() {
-                    *value -= eliminated.at(i.max(j), i.min(j));
-                }
+            .for_each(|(i, (row, own))| {
+                row.copy_from_slice(own);
+                row[i] = own[i] * (1.0 + damping) + 1e-9;
+                eliminated.take_from(i, row);
             });
         Ok(reduced)
     }
@@ -217,10 +218,20 @@ struct Eliminated {
 }
 
 impl Eliminated {
-    /// The number in row i and column j ≤ i.
-    #[inline(always)]
-    fn at(&self, i: usize, j: usize) -> f64 {
-        let (band, other) = (i / UNKNOWNS, j / UNKNOWNS);
-        self.tiles[band * (band + 1) / 2 + other].0[i % UNKNOWNS][j % UNKNOWNS]
+    /// Take row i from an equation.
+    fn take_from(&self, i: usize, row: &mut [f64]) {
+        let (band, i) = (i / UNKNOWNS, i % UNKNOWNS);
+        let tile = |band: usize, other: usize| &self.tiles[band * (band + 1) / 2 + other].0;
+        for (other, values) in row.chunks_mut(UNKNOWNS).enumerate() {
+            if other <= band {
+                for (value, own) in values.iter_mut().zip(&tile(band, other)[i]) {
+                    *value -= own;
+                }
+            } else {
+                for (value, column) in values.iter_mut().zip(tile(other, band)) {
+                    *value -= column[i];
+                }
+            }
+        }
     }
 }
