@@ -56,12 +56,6 @@ class Bundle(NamedTuple):
         """Reprojection errors [M, 2] in pixels; huge where a point is behind the camera."""
         return _project(_in_camera(self), K) - self.pixels
 
-    def misfits(self, K: np.ndarray) -> np.ndarray:
-        """Squared reprojection errors [M] by the observations' precision, in pixels²."""
-        x, y = self.residuals(K).T
-        xx, xy, yy = self.precision.T
-        return xx * x**2 + 2.0 * xy * x * y + yy * y**2
-
     def depths(self) -> np.ndarray:
         """Depth [M] of every observed point in its frame."""
         return _in_camera(self)[:, 2]
