@@ -42,15 +42,15 @@ class ObjectDetail(FreeGaussians):
 
 @torch.no_grad()
 def split_object(
-    whole: CanonicalObject, parts: int, least_opacity: float, freedom: Tensor | None = None
+    whole: CanonicalObject, parts: int | Tensor, least_opacity: float, freedom: Tensor | None = None
 ) -> ObjectDetail:
     """Every Gaussian as `parts` x `parts` smaller ones in the plane of its first two axes.
 
     They stand where the parts of its share of the surface lie, and are as much smaller.
 
     Args:
-        whole: the object.
-        parts: along each of the two axes; 1 only prunes.
+        whole: the object, N Gaussians.
+        parts: along each of the two axes, for all or for each [N]; 1 only prunes.
         least_opacity: Gaussians that are less opaque than this are left out.
         freedom: [N] in [0, 1], the factor on what the parts of each learn from now on; 1 if not given.
 
@@ -61,28 +61,28 @@ def split_object(
     if not kept.any():
         most = float(whole.opacities.max())
         raise InputError(f"least_opacity: expected {most:.3f}, the largest, or less, found {least_opacity}")
-    means, quats, scales = whole.means[kept], whole.quats[kept], whole.scales[kept]
-    axes = quat_to_matrix(quats)[..., :2] * (scales[:, None, :2] / _SIGMA_PER_SPACING)  # [M, 3, 2]
-    steps = (torch.arange(parts) + 0.5) / parts - 0.5
-    grid = torch.cartesian_prod(steps, steps).reshape(-1, 2)  # [P, 2]
-    count = len(means) * len(grid)
+    along = torch.as_tensor(parts).expand(len(kept))[kept]  # [M]
+    each = along.square()
+    index = torch.nonzero(kept).flatten().repeat_interleave(each)  # [P] what each part is a part of
+    along = along.repeat_interleave(each)
+    rank = torch.arange(len(index)) - (each.cumsum(0) - each).repeat_interleave(each)
+    place = (torch.stack([rank // along, rank % along], dim=-1) + 0.5) / along[:, None] - 0.5  # [P, 2]
+    quats, scales = whole.quats[index], whole.scales[index]
+    axes = quat_to_matrix(quats)[..., :2] * (scales[:, None, :2] / _SIGMA_PER_SPACING)  # [P, 3, 2]
+    smaller = torch.stack([1.0 / along, 1.0 / along, torch.ones(len(index))], dim=-1)
 
-    def each(values: Tensor) -> Tensor:
-        return values[:, None].expand(-1, len(grid), *values.shape[1:]).reshape(count, *values.shape[1:])
-
-    detail = ObjectDetail(count)
-    smaller = scales.new_tensor([1.0 / parts, 1.0 / parts, 1.0])
+    detail = ObjectDetail(len(index))
     detail.start(
-        (means[:, None] + torch.einsum("mij,pj->mpi", axes, grid)).reshape(count, 3),
-        each(quats),
-        each(scales * smaller),
-        each(whole.opacities[kept]),
-        each(whole.colors[kept]),
-        each(whole.normals[kept]),
+        whole.means[index] + (axes @ place[..., None])[..., 0],
+        quats,
+        scales * smaller,
+        whole.opacities[index],
+        whole.colors[index],
+        whole.normals[index],
     )
-    detail.weights.copy_(each(whole.weights[kept]))
+    detail.weights.copy_(whole.weights[index])
     if freedom is not None:
-        detail.freedom.copy_(each(freedom[kept]))
+        detail.freedom.copy_(freedom[index])
     return detail
 
 

@@ -12,6 +12,7 @@ from bigs.train.plan.config import (
     GuidanceStage,
     ObjectMotionStage,
     OptimizeStage,
+    RefineStage,
     RunConfig,
     SplitStage,
     Stage,
@@ -70,6 +71,11 @@ def _check_parameters(config: RunConfig) -> None:
     for stage in config.stages:
         if isinstance(stage, SplitStage):
             freed |= dict.fromkeys(("hand", "object") if stage.hands else ("object",), stage.name)
+        elif isinstance(stage, RefineStage):
+            if "object" not in freed:
+                raise InputError(
+                    f"config.stages.{stage.name}: expected it after a split stage, found none before"
+                )
         elif isinstance(stage, CompletionStage | GuidanceStage):
             return  # whether the object leaves its field there depends on the clip
         elif isinstance(stage, OptimizeStage):

@@ -17,7 +17,7 @@ from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights
 from bigs.models.hand_detail import free_hand
-from bigs.models.object_detail import split_object
+from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.motion.tracker import TrackedMotion
 from bigs.train.digest import run_digest
@@ -25,6 +25,7 @@ from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
 from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.loop.evidence import EvidenceSource
+from bigs.train.loop.refinement import refined
 from bigs.train.loop.run_stage import StageProgress, StageState, run_stage
 from bigs.train.loop.stopwatch import Stopwatch
 from bigs.train.loop.target_source import TargetSource
@@ -34,6 +35,7 @@ from bigs.train.plan.config import (
     GuidanceStage,
     ObjectMotionStage,
     OptimizeStage,
+    RefineStage,
     RunConfig,
     ScaleSearchStage,
     SplitStage,
@@ -193,6 +195,8 @@ def fit(
         elif isinstance(stage, SplitStage):
             for text in _split(scene, stage, sources):
                 listen({"event": "note", "stage": stage.name, "text": text})
+        elif isinstance(stage, RefineStage):
+            listen({"event": "note", "stage": stage.name, "text": _refine(scene, stage, sources)})
         elif isinstance(stage, CompletionStage | GuidanceStage):
             if isinstance(stage, CompletionStage):
                 done = run_completion(scene, stage, sources, config, start.symmetries)
@@ -228,7 +232,7 @@ def _image_sizes(stages: Sequence[Stage]) -> list[int]:
     """The sizes at which stages look at the clip's images, in their order."""
     sizes = []
     for stage in stages:
-        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage):
+        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage | RefineStage):
             sizes.append(stage.image_size)
         elif not isinstance(stage, ObjectMotionStage):
             sizes.append(OBSERVED_AT.image_size)
@@ -266,9 +270,20 @@ def _split(scene: Scene, stage: SplitStage, sources: EvidenceSource) -> list[str
         with torch.no_grad():
             whole = scene.object_splats()
         scene.object_splats = split_object(whole, stage.parts, stage.least_opacity, freedom["object"])
-        count = len(scene.object_splats.shift)
-        notes.append(f"{len(whole.means)} Gaussians of the object become {count}")
+        notes.append(_become(len(whole.means), scene.object_splats))
     return notes
+
+
+def _refine(scene: Scene, stage: RefineStage, sources: EvidenceSource) -> str:
+    """Split the object's Gaussians where it pays; returns what to report."""
+    coarse = scene.object_splats
+    freedom = shown(scene, sources.evidence(OBSERVED_AT))["object"]
+    scene.object_splats = refined(scene, coarse, stage, sources.evidence(stage), freedom)
+    return _become(len(coarse.shift), scene.object_splats)
+
+
+def _become(before: int, now: ObjectDetail) -> str:
+    return f"{before} Gaussians of the object become {len(now.shift)}"
 
 
 def _optimise(
@@ -317,9 +332,9 @@ def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None
-    if isinstance(stage, CompletionStage | GuidanceStage) and scene.object_splats is None:
+    if isinstance(stage, CompletionStage | GuidanceStage | RefineStage) and scene.object_splats is None:
         return "the clip has no object"
-    if isinstance(stage, CompletionStage):
+    if isinstance(stage, CompletionStage | RefineStage):
         return None
     if isinstance(stage, GuidanceStage):
         return "symmetry has completed the object" if report.completed else None

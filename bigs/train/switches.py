@@ -15,6 +15,7 @@ from bigs.train.plan.config import (
     ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
+    RefineStage,
     RunConfig,
     ScaleSearchStage,
     SplitStage,
@@ -150,7 +151,8 @@ def _keep_fields(config: RunConfig) -> RunConfig:
         )
 
     before, after = config.stages[: splits[0]], config.stages[splits[0] :]
-    return _keep(replace(config, stages=(*before, *map(with_fields, after))), leave_out=SplitStage)
+    of_fields = replace(config, stages=(*before, *map(with_fields, after)))
+    return _keep(of_fields, leave_out=(SplitStage, RefineStage))
 
 
 def _search_labels(config: RunConfig) -> RunConfig:
@@ -270,6 +272,10 @@ _INGREDIENTS = {
     "split": Switch(
         "free Gaussians: fields stay to the end, as in the paper",
         _keep_fields,
+    ),
+    "refine": Switch(
+        "splitting the object's Gaussians where pictures show more than they can",
+        lambda config: _keep(config, leave_out=RefineStage),
     ),
     "pyramid": Switch("coarse images before fine ones", _pyramid),
     "stopping": Switch(

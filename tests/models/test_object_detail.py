@@ -54,6 +54,22 @@ def test_parts_cover_the_same_surface(parts: int) -> None:
     torch.testing.assert_close(gaps, torch.full_like(gaps, 0.01 / parts), atol=1e-5, rtol=0)
 
 
+def test_each_has_as_many_parts_as_it_is_told() -> None:
+    whole = plate()
+    parts = torch.arange(len(whole.means)) % 3 + 1
+    opacities = torch.where(torch.arange(len(parts)) < 5, 0.01, whole.opacities)
+    detail = split_object(whole._replace(opacities=opacities), parts, 0.05)
+    fine, own = detail(), torch.arange(len(parts))[5:].repeat_interleave(parts[5:].square())
+    assert len(fine.means) == len(own)
+    for number in (1, 2, 3):
+        alike = split_object(whole._replace(opacities=opacities), number, 0.05)()
+        rows = torch.arange(len(parts))[5:].repeat_interleave(number**2)
+        for name in ("means", "quats", "scales", "opacities", "colors", "normals", "weights"):
+            torch.testing.assert_close(
+                getattr(fine, name)[parts[own] == number], getattr(alike, name)[parts[rows] == number]
+            )
+
+
 def test_what_cannot_be_seen_is_pruned() -> None:
     whole = plate()
     opacities = whole.opacities.clone()

@@ -19,7 +19,7 @@ from bigs.train.loop.image_terms import labels
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.loop.targets import Targets
-from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage
+from bigs.train.plan.config import GraspStage, OptimizeStage, RefineStage, RunConfig, ScaleSearchStage
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side
 
@@ -74,7 +74,7 @@ class EvidenceSource:
             for side, touching in self.touching().items()
         }
 
-    def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage) -> Evidence:
+    def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage | RefineStage) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets.at(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}

@@ -120,6 +120,25 @@ class SplitStage:
     least_opacity: float = 0.05
 
 
+@dataclass(frozen=True)
+class RefineStage:
+    """Split the object's free Gaussians where pictures show more than they can; prune what is transparent.
+
+    See `train.loop.refinement`.
+    """
+
+    name: str = "refine"
+    step: StepKind = "single-subject"
+    # Larger side of the pictures that say so, in pixels; 0 for the clip's own size.
+    image_size: int = 480
+    # The Gaussians split are the fewest that hold this share of the error that finer ones could explain, ...
+    error_share: float = 0.9
+    # ... each into parts x parts smaller ones.
+    parts: int = 2
+    # Gaussians less opaque than this are pruned.
+    least_opacity: float = 0.05
+
+
 # How to complete the object where no frame shows it.
 PriorKind = Literal["off", "symmetry", "trained", "sd"]
 
@@ -211,6 +230,7 @@ Stage = (
     | ScaleSearchStage
     | GraspStage
     | SplitStage
+    | RefineStage
     | CompletionStage
     | GuidanceStage
 )

@@ -157,10 +157,10 @@ def _build_stage(kinds: types.UnionType, name: str, plain: Any, where: str) -> A
         raise InputError(f"{where}: expected a stage, found {shown(plain)}")
     first, *others = typing.get_args(kinds)
     common = {f.name for f in dataclasses.fields(first)}
-    kind = next(
-        (kind for kind in others if ({f.name for f in dataclasses.fields(kind)} - common) & set(plain)), first
-    )
-    return _build_dataclass(kind, {"name": name, **plain}, where)
+    # The kind that most of the keys are peculiar to.
+    own = {kind: {f.name for f in dataclasses.fields(kind)} - common for kind in others}
+    kind = max(others, key=lambda kind: len(own[kind] & set(plain)))
+    return _build_dataclass(kind if own[kind] & set(plain) else first, {"name": name, **plain}, where)
 
 
 def _build_dataclass(kind: Any, plain: Any, where: str) -> Any:

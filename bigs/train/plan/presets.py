@@ -12,6 +12,7 @@ from bigs.train.plan.config import (
     ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
+    RefineStage,
     RunConfig,
     ScaleSearchStage,
     SplitStage,
@@ -163,6 +164,8 @@ _PLAUSIBLE_TOGETHER = {
     "object_acceleration": 0.005,
     "object_prior": 0.1,
 }
+# Images of `joint` are too coarse for finer Gaussians of the object; `RefineStage` splits them later.
+_FREED = SplitStage(parts=1)
 # Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
 # have given shape and rough colours; from here on every Gaussian has parameters of its own (`SplitStage`).
 _JOINT = OptimizeStage(
@@ -259,8 +262,9 @@ FAST = RunConfig(
         GraspStage(name="grasps-2"),
         _CONTACT,
         _REGRASP,
-        SplitStage(),
+        _FREED,
         _JOINT,
+        RefineStage(),
         _DETAIL,
         CompletionStage(),
         GuidanceStage(),
@@ -310,8 +314,9 @@ FULL = replace(
         GraspStage(name="grasps-2"),
         _CONTACT,
         _REGRASP,
-        SplitStage(),
+        _FREED,
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
+        RefineStage(image_size=640),
         replace(
             _DETAIL,
             steps=1000,
@@ -340,9 +345,10 @@ SMOKE = replace(
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
         replace(_REGRASP, steps=8, image_size=80),
-        SplitStage(),
+        _FREED,
         # Too few steps for frames to get anywhere on their own.
         replace(_JOINT, steps=12, image_size=80, frames_per_step=3, frame_moments=False),
+        RefineStage(image_size=120),
         replace(_DETAIL, steps=6, image_size=120, frames_per_step=3),
         CompletionStage(),
         GuidanceStage(steps=4, views=2),

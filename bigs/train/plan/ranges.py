@@ -23,6 +23,7 @@ from bigs.train.plan.config import (
     GuidanceStage,
     OpeningConfig,
     OptimizeStage,
+    RefineStage,
     RunConfig,
     ScaleSearchStage,
     SplitStage,
@@ -145,6 +146,12 @@ RANGES: dict[type, dict[str, Range]] = {
         "anchor_outlier": _POSITIVE,
     },
     SplitStage: {"parts": Range(1, 10), "least_opacity": _SHARE},
+    RefineStage: {
+        "image_size": _PIXELS,
+        "error_share": _SHARE,
+        "parts": Range(1, 10),
+        "least_opacity": _SHARE,
+    },
     GuidanceStage: {
         "views": Range(1, 1000),
         "image_size": Range(16, 1 << 12),

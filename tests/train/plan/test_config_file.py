@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from bigs.checks import InputError
-from bigs.train.plan.config import OptimizeStage, RunConfig, ScaleSearchStage
+from bigs.train.plan.config import OptimizeStage, RefineStage, RunConfig, ScaleSearchStage, SplitStage
 from bigs.train.plan.config_file import from_plain, load_config, save_config, to_plain, with_changes
 from bigs.train.plan.presets import PRESETS
 
@@ -90,6 +90,12 @@ def test_defaults_fill_what_is_left_out() -> None:
     only = OptimizeStage("one", "single-subject", 3, {"hand.ray": 1.0}, {"mask": 1.0})
     assert config == RunConfig(stages=(only,))
     assert type(config.stages[0].weights["mask"]) is float
+
+
+@pytest.mark.parametrize("kind", [SplitStage, RefineStage])
+def test_the_kind_of_a_stage_is_the_one_that_has_its_keys(kind: type) -> None:
+    config = RunConfig(stages=(kind(name="a"), kind(name="b", parts=3)))
+    assert from_plain(to_plain(config)) == config
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from bigs.checks import InputError
 from bigs.train.check_plan import check_plan
 from bigs.train.loop.optim import GROUPS
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
-from bigs.train.plan.config import OptimizeStage, RunConfig
+from bigs.train.plan.config import OptimizeStage, RefineStage, RunConfig
 from bigs.train.plan.presets import PRESETS, SMOKE
 from bigs.train.switches import without
 
@@ -94,6 +94,12 @@ def test_a_rate_of_what_nothing_has_is_refused(stage: str, group: str, words: st
     config = replace(SMOKE, stages=stages, lighting=group != "scene.light")
     with pytest.raises(InputError, match=rf"stages\.{stage}\.lrs: {words}"):
         check_plan(config)
+
+
+def test_only_free_gaussians_are_refined() -> None:
+    refine = next(stage for stage in SMOKE.stages if isinstance(stage, RefineStage))
+    with pytest.raises(InputError, match=r"stages\.refine: expected it after a split stage, found none"):
+        check_plan(replace(SMOKE, stages=(refine, *(s for s in SMOKE.stages if s is not refine))))
 
 
 @pytest.mark.parametrize("name", ["smoke", "fast", "full"])
