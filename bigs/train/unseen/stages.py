@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
+
 from bigs.geometry.symmetry import Symmetry
 from bigs.guidance.denoiser import Denoiser
 from bigs.models.occlusion import measure_occlusion
@@ -13,6 +15,7 @@ from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.run_stage import StageState
 from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage, RunConfig
 from bigs.train.start.build import SceneStart
+from bigs.train.unseen.learned_surface import learned_surface
 from bigs.train.unseen.openings import openings, without_openings
 from bigs.train.unseen.prior_stage import guide_scene
 from bigs.train.unseen.symmetry_stage import StageOutcome, complete_scene
@@ -72,26 +75,31 @@ def run_guidance(
 def finish_mesh(
     scene: Scene, start: SceneStart, sources: EvidenceSource, config: RunConfig, completed: bool
 ) -> dict[str, str]:
-    """Leave out of the object's mesh what nothing supports and what is seen through; returns facts to report.
+    """The object's mesh, with what was learned and without what nothing supports; returns facts to report.
+
+    What is seen through is left out, too.
 
     `completed` says that symmetry completed it, which supports all of it.
     """
     facts: dict[str, str] = {}
     surface = scene.object_surface
-    if surface is None:
+    if surface is None or scene.object_splats is None:
         return facts
+    with torch.no_grad():
+        learned = learned_surface(surface, scene.object_splats())
     if start.known and not completed:
-        surface = start.known.of(surface)
+        surface, learned = start.known.of(surface), start.known.of(learned)
         facts["object mesh"] = (
             f"open: {start.known.left_out:.0%} of it would be further than "
             f"{1e3 * config.initial.surface_kept:.0f} mm from anything seen"
         )
     if config.openings is not None:
+        # Of the start's surface, which the measured points helped to make.
         found = openings(scene, surface, sources.evidence(OBSERVED_AT), start.measured, config.openings)
         if found.any():
-            surface = without_openings(surface, found)
+            learned = without_openings(learned, found)
             facts["object openings"] = (
                 f"{found.mean():.0%} of the mesh, where hands or points are seen through it"
             )
-    scene.replace_surface(surface)
+    scene.replace_surface(learned)
     return facts
