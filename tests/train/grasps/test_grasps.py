@@ -182,6 +182,15 @@ def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
         torch.testing.assert_close(expected[~grasped], (true + believed)[~grasped], atol=0.02, rtol=0)
 
 
+def test_beyond_the_grasps_the_estimate_is_believed_more() -> None:
+    """A hand that comes from far away is not thought to stay where it first held the object."""
+    grasped = torch.zeros(30, dtype=torch.bool)
+    grasped[12:18] = True
+    true = torch.where(grasped, -0.4, -0.2)
+    expected = expected_depths(torch.full((30,), -0.4), true + 0.05, grasped)
+    torch.testing.assert_close(expected[~grasped], torch.full((24,), -0.25), atol=0.03, rtol=0)
+
+
 def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
     scene = cube_scene({"right": builtin_hand()})
     step = Step(scene, None, {}, Selection(torch.arange(3)))
