@@ -16,7 +16,7 @@ from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
 from bigs.train.loop.image_terms import labels
-from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.loop.targets import Targets
 from bigs.train.plan.config import GraspStage, OptimizeStage, RefineStage, RunConfig, ScaleSearchStage
@@ -93,7 +93,7 @@ class EvidenceSource:
     def occlusion(self, stage: ScaleSearchStage) -> Callable[[], float]:
         """The label term of the scene as it is, over some frames: which subject hides which."""
         evidence = self.evidence(stage)
-        frames = torch.linspace(0, len(self.clip) - 1, min(stage.frames, len(self.clip))).round().long()
+        frames = spread_frames(len(self.clip), stage.frames)
         entities = self.scene.entities
         with torch.no_grad():
             canonical = self.scene.canonical(entities)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
-from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.plan.config import RefineStage
 
 # Number of frames that are compared, and of those rendered together: fewer calls, but little memory.
@@ -44,8 +44,7 @@ def unresolved(scene: Scene, evidence: Evidence) -> Unresolved:
     canonical = scene.canonical(scene.entities)
     count = len(canonical["object"].scales)
     error, pixels = torch.zeros(count), torch.zeros(count)
-    frames = torch.linspace(0, scene.n_frames - 1, min(_FRAMES, scene.n_frames)).round().long()
-    for batch in frames.split(_TOGETHER):
+    for batch in spread_frames(scene.n_frames, _FRAMES).split(_TOGETHER):
         step = Step(scene, evidence, canonical, Selection(batch, scene.entities, labels=False))
         shows = step.share("object")[..., None]
         off = step.together.colors - step.images
@@ -99,4 +98,6 @@ def refined(
     coarse = fewest_holding(found.error, stage.error_share) & (found.pixels >= _LEAST_PIXELS)
     with torch.no_grad():
         whole = splats()
-    return split_object(whole, torch.where(coarse, stage.parts, 1), stage.least_opacity, freedom)
+    # An object that pictures make transparent altogether keeps its most opaque Gaussian.
+    least = min(stage.least_opacity, float(whole.opacities.max()))
+    return split_object(whole, torch.where(coarse, stage.parts, 1), least, freedom)

@@ -236,6 +236,11 @@ class Step:
         return self.scene.object_splats is not None
 
 
+def spread_frames(n_frames: int, most: int) -> Tensor:
+    """At most so many frames of a clip, evenly spread."""
+    return torch.linspace(0, n_frames - 1, min(most, n_frames)).round().long()
+
+
 def _at(values: Tensor, frames: Tensor) -> Tensor:
     """Values [T, ...] of `frames` [B], which rise: all of them are not worth a copy."""
     return values if len(frames) == len(values) else values[frames]

@@ -15,7 +15,7 @@ from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.raster.settings import RasterSettings
-from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.loop.virtual_views import object_orbit, render_object
 from bigs.train.plan.config import GuidanceStage
 from bigs.train.unseen.prior_descent import (
@@ -177,7 +177,7 @@ def frame_loss(scene: Scene, evidence: Evidence, canonical: CanonicalObject, wei
 
     Summed over the pixels in which nothing hides the object, if it is there; background counts.
     """
-    frames = torch.linspace(0, scene.n_frames - 1, min(_KEEPING_FRAMES, scene.n_frames)).round().long()
+    frames = spread_frames(scene.n_frames, _KEEPING_FRAMES)
 
     def picture(now: CanonicalObject, frames: Tensor) -> Tensor:
         step = Step(scene, evidence, {"object": now}, Selection(frames, ("object",), labels=False))

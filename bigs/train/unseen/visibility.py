@@ -13,7 +13,8 @@ from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.losses.photometric import masked_l1
 from bigs.models.canonical import CanonicalObject
 from bigs.models.scene import Scene
-from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.refinement import over_pixels
+from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.types import Entity, Gaussians
 
 # Typical error of poses, metres.
@@ -47,31 +48,23 @@ def frames_seen(canonical: CanonicalObject, views: ObjectViews) -> np.ndarray:
     return times_seen(views, points, canonical.normals.numpy(), points, TOLERANCE)
 
 
-def guard_frames(n_frames: int, most: int = _GUARD_FRAMES) -> Tensor:
-    """At most so many frames of a clip, evenly spread."""
-    return torch.linspace(0, n_frames - 1, min(most, n_frames)).round().long()
+def guard_frames(n_frames: int) -> Tensor:
+    """The frames of a clip on which errors are measured."""
+    return spread_frames(n_frames, _GUARD_FRAMES)
 
 
+@torch.no_grad()
 def weights_in_pictures(scene: Scene, evidence: Evidence) -> Tensor:
     """The most [N] that each of the object's Gaussians weighs in the picture of any frame, in pixels.
 
-    Colours are blended linearly, so the gradient of the summed picture is the weight, whatever hands and
-    nearer surface hide.
+    What hands and nearer surface hide weighs nothing.
     """
-    with torch.no_grad():
-        canonical = scene.canonical(scene.entities)
-    count = len(canonical["object"].means)
+    canonical = scene.canonical(scene.entities)
+    count = len(canonical["object"].scales)
     most = torch.zeros(count)
     for frames in torch.arange(scene.n_frames).split(_TOGETHER):
         step = Step(scene, evidence, canonical, Selection(frames, scene.entities, labels=False))
-        with torch.no_grad():
-            posed = scene.at(frames).posed(canonical)
-        # Each frame has its own, so that the gradients stay apart.
-        ink = torch.ones(len(frames), count, 1, requires_grad=True)
-        # The object is the last of a scene's entities.
-        others = torch.zeros(len(frames), posed.means.shape[1] - count, 1)
-        picture = step.render(posed._replace(colors=torch.cat([others, ink], dim=1)))
-        (weights,) = torch.autograd.grad(picture.colors.sum(), ink)
+        weights = over_pixels(step, torch.ones_like(step.share("object"))[..., None], count)
         most = torch.maximum(most, weights[..., 0].amax(0))
     return most
 
@@ -90,7 +83,7 @@ def shown(scene: Scene, evidence: Evidence) -> dict[Entity, Tensor]:
     own: dict[Entity, Tensor] = {}
     whole: dict[Entity, Tensor] = {}
     part: dict[Entity, Tensor] = {}
-    for frames in guard_frames(scene.n_frames, _SHOWN_FRAMES).split(_TOGETHER):
+    for frames in spread_frames(scene.n_frames, _SHOWN_FRAMES).split(_TOGETHER):
         step = Step(scene, evidence, canonical, Selection(frames, scene.entities, labels=False))
         with torch.no_grad():
             posed = scene.at(frames).posed(canonical)

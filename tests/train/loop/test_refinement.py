@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,17 @@ def test_a_print_is_split_and_a_tint_is_not(made: tuple[Scene, Evidence]) -> Non
     assert (copies[always_right] == 1).all()
     assert (copies[always_left & (found.pixels >= 2.0)] == 4).float().mean() > 0.7
     assert (copies[found.pixels < 2.0] == 1).all(), "what is smaller than a pixel stays whole"
+
+
+def test_transparent_gaussians_are_pruned_but_never_all(made: tuple[Scene, Evidence]) -> None:
+    scene, evidence = made
+    for faint, kept in ((10, 590), (600, 1)):
+        splats = copy.deepcopy(scene.object_splats)
+        assert isinstance(splats, ObjectDetail)
+        with torch.no_grad():
+            splats.opacity[:faint] = torch.linspace(-20.0, -19.0, faint)
+        whole = RefineStage(image_size=240, error_share=0.0)
+        assert len(refined(scene, splats, whole, evidence, torch.ones(600)).shift) == kept
 
 
 def test_pixels_add_up_to_what_shows(made: tuple[Scene, Evidence]) -> None:
