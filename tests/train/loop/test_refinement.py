@@ -95,7 +95,7 @@ def test_transparent_gaussians_are_pruned_but_never_all(made: tuple[Scene, Evide
         splats = copy.deepcopy(scene.object_splats)
         assert isinstance(splats, ObjectDetail)
         with torch.no_grad():
-            splats.opacity[:faint] = torch.linspace(-20.0, -19.0, faint)
+            splats.opacity_logits[:faint] = torch.linspace(-20.0, -19.0, faint)
         whole = RefineStage(image_size=240, error_share=0.0)
         assert len(refined(scene, splats, whole, evidence, torch.ones(600)).shift) == kept
 
