@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,29 @@ from scipy.spatial import cKDTree
 
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.types import MASK_VALUES, HandObjectTrajectory
+from bigs.hand import HandModel
+from bigs.models.scene import Scene
+from bigs.train.fit import fit
+from bigs.train.loop.evidence import EvidenceSource
+from bigs.train.loop.step import Evidence
+from bigs.train.loop.target_source import TargetSource
+from bigs.train.plan.config import OptimizeStage, RefineStage, RunConfig
+from bigs.types import MASK_VALUES, HandObjectTrajectory, Side
+
+
+def fitted_view(
+    clip: Clip,
+    truth: HandObjectTrajectory,
+    frames: range,
+    hand_models: Mapping[Side, HandModel],
+    plan: RunConfig,
+    stage: OptimizeStage | RefineStage,
+) -> tuple[Scene, Evidence]:
+    """A scene that `plan` fitted to such a view without unlabelled occluders, and what `stage` looks at."""
+    clip = limited_view(clip, truth, frames)
+    scene, _ = fit(clip, hand_models, plan)
+    nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
+    return scene, EvidenceSource(TargetSource(clip, nothing), scene, plan, None).evidence(stage)
 
 
 def limited_view(clip: Clip, truth: HandObjectTrajectory, frames: range) -> Clip:

@@ -5,21 +5,17 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from limited_view import limited_view
+from limited_view import fitted_view
 from torch import Tensor
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
-from bigs.train.fit import fit
-from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.refinement import fewest_holding, over_pixels, refined, unresolved
 from bigs.train.loop.step import Evidence, Selection, Step
-from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import PriorConfig, RefineStage, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.types import HandObjectTrajectory, Side
@@ -37,10 +33,7 @@ PLAN = replace(
 def made(
     whole_bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
 ) -> tuple[Scene, Evidence]:
-    clip = limited_view(*whole_bottle, range(3))
-    scene, _ = fit(clip, both_hands, PLAN)
-    nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
-    return scene, EvidenceSource(TargetSource(clip, nothing), scene, PLAN, None).evidence(STAGE)
+    return fitted_view(*whole_bottle, range(3), both_hands, PLAN, STAGE)
 
 
 @torch.no_grad()

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from limited_view import limited_view
+from limited_view import fitted_view, limited_view
 
 from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.fit import fit
-from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Evidence
-from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import PriorConfig, SplitStage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.unseen.stages import OBSERVED_AT
@@ -31,10 +28,7 @@ PLAN = replace(
 def posed(
     whole_bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
 ) -> tuple[Scene, Evidence]:
-    clip = limited_view(*whole_bottle, range(6))
-    scene, _ = fit(clip, both_hands, PLAN)
-    nothing = np.zeros((len(clip), clip.height, clip.width), dtype=bool)
-    return scene, EvidenceSource(TargetSource(clip, nothing), scene, PLAN, None).evidence(OBSERVED_AT)
+    return fitted_view(*whole_bottle, range(6), both_hands, PLAN, OBSERVED_AT)
 
 
 @pytest.fixture(scope="module")
