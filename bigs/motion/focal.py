@@ -7,7 +7,7 @@ calibration is better than that, and one that somebody guessed is often worse. B
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,9 +33,13 @@ class FocalConfig:
     # More observations than this add time and no certainty, and fewer do not tell a focal length.
     most_observations: int = 40_000
     least_observations: int = 1000
-    # Errors of tracks are correlated: true errors are so many times those of independent ones, and never
-    # less than `least_sigma`.
-    caution: float = 10.0
+    # Pixels beyond which an observation loses weight: less than for poses, since the best tracks know the
+    # focal length best.
+    pixel_sigma: float = 0.1
+    # What lasts of an error along a track, as where reflections lag behind, is shared by whole parts of the
+    # object, too: it counts so many times as much as if each sighting erred for itself.
+    shared: float = 8.5
+    # No measurement is better than this.
     least_sigma: float = 0.01
 
 
@@ -83,6 +87,7 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
     `sigma` is infinite where they say nothing.
     """
     bundle = _thinned(bundle, config.most_observations)
+    scales = replace(scales, pixel_sigma=config.pixel_sigma)
     free = np.ones(len(bundle.rotations), dtype=bool)
     problem = make_problem(bundle, K, scales, free, None)
     growth, damping, sigma = 0.0, 1e-3, np.inf
@@ -106,12 +111,38 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
             damping *= 8.0
         else:
             break
-        sigma = config.caution / np.sqrt(step.stiffness)
+        sigma = 1.0 / np.sqrt(step.stiffness)
         gain, cost, bundle, problem = cost - new_cost, new_cost, candidate, nearer
         growth, damping = growth + step.growth, max(damping / 6.0, 1e-6)
         if gain < config.tolerance * cost:
             break
-    return FocalLength(float(np.exp(growth)), float(np.hypot(sigma, config.least_sigma)))
+    shared = config.shared * lasting_error(bundle, problem.K) / config.pixel_sigma
+    return FocalLength(
+        float(np.exp(growth)), float(np.hypot(sigma * np.hypot(1.0, shared), config.least_sigma))
+    )
+
+
+def lasting_error(bundle: Bundle, K: np.ndarray) -> float:
+    """The standard deviation in pixels of that part of observations' errors that lasts along their tracks.
+
+    Errors of sightings of a point two sightings apart are compared, since the method may have carried one to
+    the next frame. Medians in place of squares leave outliers out. 0 where nothing lasts.
+    """
+    order = np.lexsort((bundle.frame, bundle.point))
+    errors, point = bundle.residuals(K)[order], bundle.point[order]
+    together = point[_APART:] == point[:-_APART]
+    before, after = errors[:-_APART][together], errors[_APART:][together]
+    if len(before) == 0:
+        return 0.0
+    # The variance of a sum less that of a difference is four times the covariance.
+    sums, differences = (np.median(np.abs(v)) for v in (before + after, before - after))
+    return float(_OF_MEDIAN / 2.0 * np.sqrt(max(sums**2 - differences**2, 0.0)))
+
+
+# Sightings between which errors are compared.
+_APART = 2
+# A normal deviate's standard deviation in those of the median of its size.
+_OF_MEDIAN = 1.4826
 
 
 def scaled_focal(K: np.ndarray, factor: float) -> np.ndarray:

@@ -9,11 +9,18 @@ import pytest
 from turning_object import K, turning_object
 
 from bigs.motion.bundle import Bundle, BundleConfig, adjust, alike
-from bigs.motion.focal import FocalConfig, FocalLength, believed_focal, measured_focal, scaled_focal
+from bigs.motion.focal import (
+    FocalConfig,
+    FocalLength,
+    believed_focal,
+    lasting_error,
+    measured_focal,
+    scaled_focal,
+)
 
 SCALES = BundleConfig(pixel_sigma=0.15, iterations=60, tolerance=1e-9)
 # Errors of tracks as they are told apart, without what is added for those of real ones.
-BARE = FocalConfig(caution=1.0, least_sigma=0.0, least_observations=100)
+BARE = FocalConfig(shared=0.0, least_sigma=0.0, least_observations=100, pixel_sigma=0.15)
 
 
 def seen_through(factor: float, noise: float, frames: int = 30, seed: int = 0) -> Bundle:
@@ -44,6 +51,39 @@ def test_the_error_told_is_the_error_made() -> None:
         told.append(found.sigma)
     usual = float(np.sqrt(np.mean(np.square(off))))
     assert 0.3 * np.mean(told) < usual < 2.0 * np.mean(told)
+
+
+def drifting(share: float, seed: int = 0) -> Bundle:
+    """The egg with errors of 0.3 pixels, whose variance is to this share the same along half a track."""
+    bundle = seen_through(1.0, 0.0)
+    rng = np.random.default_rng(seed)
+    own = rng.normal(0.0, 0.3, bundle.pixels.shape)
+    of_half = rng.normal(0.0, 0.3, (len(bundle.points), 2, 2))
+    middle = np.bincount(bundle.point, bundle.frame)[bundle.point] / np.bincount(bundle.point)[bundle.point]
+    lasts = of_half[bundle.point, (bundle.frame > middle).astype(int)]
+    errors = np.sqrt(1.0 - share) * own + np.sqrt(share) * lasts
+    rows = rng.permutation(len(errors))
+    return bundle._replace(
+        pixels=(bundle.pixels + errors)[rows], frame=bundle.frame[rows], point=bundle.point[rows]
+    )
+
+
+def test_an_error_that_lasts_is_told_from_noise() -> None:
+    assert lasting_error(drifting(0.0), K) < 0.06
+    # Halves of a track err in two ways, so that a few of its pairs share nothing.
+    assert lasting_error(drifting(1.0), K) == pytest.approx(0.3, rel=0.2)
+    assert lasting_error(drifting(0.5), K) == pytest.approx(0.3 * np.sqrt(0.5), rel=0.2)
+    alone = drifting(1.0)
+    first = np.unique(alone.point, return_index=True)[1]
+    alone = alone._replace(frame=alone.frame[first], point=alone.point[first], pixels=alone.pixels[first])
+    assert lasting_error(alone, K) == 0.0
+
+
+def test_errors_that_last_make_the_focal_length_less_certain() -> None:
+    config = replace(BARE, shared=FocalConfig().shared)
+    noisy, lagging = (measured_focal(drifting(share), K, SCALES, config).sigma for share in (0.0, 0.8))
+    assert lagging > 2.0 * noisy
+    assert measured_focal(drifting(0.8), K, SCALES, BARE).sigma < lagging
 
 
 def test_the_step_is_that_of_the_dense_equations() -> None:

@@ -69,7 +69,8 @@ def over_pixels(step: Step, values: Tensor, count: int) -> Tensor:
         ink = torch.ones(len(values), count, channels, requires_grad=True)
         others = torch.zeros(len(values), posed.means.shape[1] - count, channels)
         picture = step.render(posed._replace(colors=torch.cat([others, ink], dim=1))).colors
-        (sums,) = torch.autograd.grad(picture, ink, values)
+        # Not `grad(picture, ink, values)`: torch then imports a computer algebra system, which takes a while.
+        (sums,) = torch.autograd.grad((picture * values).sum(), ink)
     return sums
 
 

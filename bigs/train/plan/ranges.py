@@ -129,7 +129,7 @@ RANGES: dict[type, dict[str, Range]] = {
     FollowConfig: {"levels": _COUNT, "half": Range(1, 100), "guides": _COUNT},
     FocalConfig: {
         "calibrated": _SHARE,
-        **dict.fromkeys(("calibrated_sigma", "guessed_sigma", "caution"), _POSITIVE),
+        **dict.fromkeys(("calibrated_sigma", "guessed_sigma", "pixel_sigma"), _POSITIVE),
         "most_observations": _COUNT,
     },
     MapConfig: {"keep_error": _POSITIVE, "least_observations": Range(2, 10**6)},
