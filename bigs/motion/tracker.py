@@ -22,6 +22,7 @@ from bigs.motion.features import FrameFeatures, extract_features
 from bigs.motion.focal import believed_focal, scaled_focal
 from bigs.motion.follow import follow
 from bigs.motion.given_poses import GivenPoses, bridged, contradicted_frames, pairs_to_match
+from bigs.motion.masks import without_gaps
 from bigs.motion.models import match_features
 from bigs.motion.object_map import ObjectMap
 from bigs.motion.patches import Pictures, sharpen
@@ -66,6 +67,7 @@ def track(
         given: poses; those of frames with `trust` 0 only fill a gap.
         config: see there.
     """
+    masks = without_gaps(masks)
     features = extract_features(images, masks, config.features)
     pairs = pairs_to_match(given, config)
     matches = match_features(features, K, (masks.shape[2], masks.shape[1]), pairs, config.matching)

@@ -12,6 +12,7 @@ from bigs.checks import InputError
 from bigs.motion.features import FeatureConfig, FrameFeatures, extract_features
 from bigs.motion.follow import FollowConfig, follow
 from bigs.motion.grow import GrowConfig, grow
+from bigs.motion.masks import without_gaps
 from bigs.motion.models import Mapping, MappingConfig, frame_pairs, map_features
 from bigs.motion.object_map import MapConfig, ObjectMap
 from bigs.motion.patches import PatchConfig, Pictures, sharpen
@@ -116,7 +117,7 @@ def structure_from_motion(
         )
     first, last = int(shown[0]), int(shown[-1]) + 1
     clip = slice(first, last)
-    object_masks = masks[clip] == MASK_VALUES["object"]
+    object_masks = without_gaps(masks[clip] == MASK_VALUES["object"])
     size = (masks.shape[2], masks.shape[1])
     candidates = None
     if matcher is None:

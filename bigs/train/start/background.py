@@ -15,7 +15,9 @@ import numpy as np
 import scipy.ndimage
 
 from bigs.data.base import Clip
+from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
+from bigs.types import MASK_VALUES
 
 # Colours (in [0, 1]) that differ by more than this belong to different surfaces; noise and soft shadows
 # differ less.
@@ -29,6 +31,8 @@ _CONTESTED_SHARE = 0.05
 _COLOR_CELLS = 16
 _ROUNDS = 8
 _NEIGHBOURHOOD = 2.0
+# How far, in compared pixels, a subject may have moved beyond where the frames around show it.
+_MOVED = 10
 # Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
 # Exposures that differ by less are the same, and what is darker than this says nothing of them.
@@ -41,12 +45,13 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     """Where an unlabelled occluder may hide a hand or the object.
 
     Returns:
-        [T, H, W] bool at the clip's size; all False when the background does not stand still.
+        [T, H, W] bool at the clip's size. When the background does not stand still, only what masks lost.
     """
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
     images = np.stack(side_by_side(lambda t: clip.image(t)[::step, ::step], frames))
-    background = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames)) == 0
+    labels = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames))
+    background = labels == 0
     looks = _looks(images, background)
     gains = _gains(images, background, looks.usual)
     if (gains != 1.0).any():
@@ -58,8 +63,14 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
         np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
         & background
     )
-    if unknown.sum() > _USELESS_SHARE * background.sum():
-        return np.zeros((len(clip), clip.height, clip.width), dtype=bool)
+    unknown = (
+        _lost(labels) if unknown.sum() > _USELESS_SHARE * background.sum() else _whole(unknown, background)
+    )
+    return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+
+
+def _whole(unknown: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Occluders [T, H, W] without crumbs at mask borders and without holes."""
     # Mask borders mix two colours in one pixel; an occluder is wider than that.
     cross = scipy.ndimage.generate_binary_structure(2, 1)[None]
     unknown = scipy.ndimage.binary_opening(unknown, cross, iterations=1)
@@ -69,8 +80,23 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     padded = np.pad(unknown | ~background, ((0, 0), (_CLOSE, _CLOSE), (_CLOSE, _CLOSE)), mode="edge")
     closed = scipy.ndimage.binary_closing(padded, cross, iterations=_CLOSE)[:, _CLOSE:-_CLOSE, _CLOSE:-_CLOSE]
     near = scipy.ndimage.binary_dilation(unknown, cross, iterations=2 * _CLOSE)
-    unknown |= closed & near & background
-    return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+    return unknown | (closed & near & background)
+
+
+def _lost(labels: np.ndarray) -> np.ndarray:
+    """Where in the background of masks [T, H, W] a subject may be whose own mask a few frames lack: bool.
+
+    Masks say of such a frame that the subject is elsewhere, and it would be fitted to that. A frame without
+    any mask says nothing at all.
+    """
+    lost = np.zeros(labels.shape, dtype=bool)
+    for value in MASK_VALUES.values():
+        own = labels == value
+        for before, after in short_gaps(own.any(axis=(1, 2))):
+            around = own[before] | own[after]
+            lost[before + 1 : after] |= scipy.ndimage.binary_dilation(around, iterations=_MOVED)
+    lost[~labels.any(axis=(1, 2))] = True
+    return lost & (labels == 0)
 
 
 def _gains(images: np.ndarray, background: np.ndarray, usual: np.ndarray) -> np.ndarray:

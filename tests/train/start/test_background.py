@@ -102,6 +102,24 @@ def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator)
     assert not unknown_occluders(clip).any()
 
 
+def test_a_moving_camera_leaves_unknown_what_masks_lost(tmp_path: Path, rng: np.random.Generator) -> None:
+    wide = room(rng, WIDTH + 12 * FRAMES)
+    images = np.stack([wide[:, 12 * t : 12 * t + WIDTH] for t in range(FRAMES)])
+    hand, thing = moving_box(10, 5, 12, 12, 2), moving_box(40, 20, 10, 10, 1)
+    labels = np.where(hand, np.uint8(150), np.where(thing, np.uint8(50), np.uint8(0)))
+    labels[2][hand[2]] = 0
+    labels[4:6] = 0
+    labels[7] = np.where(thing[7], np.uint8(50), np.uint8(0))
+    labels[8] = 0
+    found = unknown_occluders(painted_clip(tmp_path, to_bytes(images, rng), labels))
+    # The hand of one frame, where it may be, and not the object that covers it.
+    assert found[2][hand[2]].all() and not found[2][thing[2]].any() and found[2].mean() < 0.4
+    # Frames without any mask say nothing, at the clip's end either.
+    assert found[4:6].all() and found[8].all()
+    # The hand has not come back by the end, so it may be gone.
+    assert not found[[0, 1, 3, 6, 7]].any()
+
+
 def test_border_pixels_of_a_mask_are_no_occluder(tmp_path: Path, rng: np.random.Generator) -> None:
     """Masks are cut sharp, images are not: one mixed pixel around a moving hand is nothing."""
     hand = moving_box(20, 5, 20, 20, 4)
