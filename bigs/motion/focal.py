@@ -35,10 +35,10 @@ class FocalConfig:
     least_observations: int = 1000
     # Pixels beyond which an observation loses weight: less than for poses, since the best tracks know the
     # focal length best.
-    pixel_sigma: float = 0.1
+    pixel_sigma: float = 0.15
     # What lasts of an error along a track, as where reflections lag behind, is shared by whole parts of the
     # object, too: it counts so many times as much as if each sighting erred for itself.
-    shared: float = 8.5
+    shared: float = 11.0
     # No measurement is better than this.
     least_sigma: float = 0.01
 
