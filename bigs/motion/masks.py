@@ -23,7 +23,7 @@ def without_gaps(masks: np.ndarray) -> np.ndarray:
     Returns:
         [T, H, W] bool; gaps at either end and longer ones stay.
     """
-    gaps = short_gaps(masks.any(axis=(1, 2)))
+    gaps = short_gaps(np.any(masks, axis=(1, 2)))
     if not gaps:
         return masks
     filled = masks.copy()
