@@ -125,8 +125,8 @@ def measured_focal(bundle: Bundle, K: np.ndarray, scales: BundleConfig, config: 
 def lasting_error(bundle: Bundle, K: np.ndarray) -> float:
     """The standard deviation in pixels of that part of observations' errors that lasts along their tracks.
 
-    Errors of sightings of a point two sightings apart are compared, since the method may have carried one to
-    the next frame. Medians in place of squares leave outliers out. 0 where nothing lasts.
+    Compared are errors two sightings apart, since a feature that is followed brings its error along to the
+    next frame. Medians in place of squares leave outliers out. 0 where nothing lasts.
     """
     order = np.lexsort((bundle.frame, bundle.point))
     errors, point = bundle.residuals(K)[order], bundle.point[order]

@@ -86,6 +86,14 @@ def test_errors_that_last_make_the_focal_length_less_certain() -> None:
     assert measured_focal(drifting(0.8), K, SCALES, BARE).sigma < lagging
 
 
+def test_settings_of_the_focal_length_are_its_own() -> None:
+    bundle = drifting(0.2)
+    usual = measured_focal(bundle, K, SCALES, BARE)
+    assert measured_focal(bundle, K, replace(SCALES, pixel_sigma=9.0), BARE) == usual
+    assert measured_focal(bundle, K, SCALES, replace(BARE, pixel_sigma=0.05)).factor != usual.factor
+    assert measured_focal(bundle, K, SCALES, replace(BARE, least_sigma=0.05)).sigma >= 0.05 > usual.sigma
+
+
 def test_the_step_is_that_of_the_dense_equations() -> None:
     """One step from a start that is off, against the normal equations of finite differences."""
     import bigs.motion.focal as focal

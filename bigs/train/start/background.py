@@ -4,7 +4,8 @@ Masks label a sleeve as background, yet it hides a hand as an object does. With 
 background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
 most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
 colours, the one that the clip's occluders have elsewhere belongs to an occluder. Where the exposure wavers,
-images are brought to one exposure first.
+images are brought to one exposure first. Before a background that moves nothing is known but which masks were
+lost: what they showed may still be there.
 """
 
 from __future__ import annotations
