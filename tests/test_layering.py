@@ -94,6 +94,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "start": {"plan"},
         "grasps": {"plan"},
         "loop": {"plan", "start", "grasps"},
+        "moves": {"plan", "grasps", "loop"},
         "unseen": {"plan", "start", "loop"},
     },
     "commands": {

@@ -77,6 +77,11 @@ class Grasps(nn.Module):
             self.mirrored,
         )
 
+    def release(self, frames: list[int]) -> None:
+        """Let go of the hand in some frames, at grasps' ends; it then has its own poses there."""
+        self.of_frame[frames] = -1
+        self.certainty[frames] = 0.0
+
     @torch.no_grad()
     def set(
         self,

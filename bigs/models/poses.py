@@ -58,12 +58,12 @@ class RayPositions(nn.Module):
         return torch.cat([(self.base_ray[frames] + ray) * depth[:, None], depth[:, None]], dim=-1)
 
     @torch.no_grad()
-    def restart(self, positions: Tensor) -> None:
-        """Take `positions` [T, 3] for the start; the residuals become zero."""
-        self.base_ray.copy_(positions[:, :2] / positions[:, 2:])
-        self.base_log_depth.copy_(positions[:, 2].log())
-        self.ray.zero_()
-        self.log_depth.zero_()
+    def restart(self, positions: Tensor, frames: Tensor | slice = slice(None)) -> None:
+        """Take `positions` [B, 3] of some frames, or of all, for their start; their residuals become zero."""
+        self.base_ray[frames] = positions[:, :2] / positions[:, 2:]
+        self.base_log_depth[frames] = positions[:, 2].log()
+        self.ray[frames] = 0.0
+        self.log_depth[frames] = 0.0
 
 
 class HandPoses(nn.Module):
@@ -117,11 +117,17 @@ class HandPoses(nn.Module):
     @torch.no_grad()
     def restart(self, poses: HandFrames) -> None:
         """Take `poses` of all T frames for the start; the residuals become zero."""
-        self.base_orient.copy_(poses.global_orient)
-        self.base_pose.copy_(poses.hand_pose)
-        for residual in (self.orient, self.pose, self.pose_bias):
-            residual.zero_()
-        self.position.restart(poses.wrist)
+        self.pose_bias.zero_()
+        self.restart_frames(torch.arange(len(self.orient)), poses)
+
+    @torch.no_grad()
+    def restart_frames(self, frames: Tensor, poses: HandFrames) -> None:
+        """Take `poses` of some frames [B] for their start; of the residuals only the shared one stays."""
+        self.base_orient[frames] = poses.global_orient
+        self.base_pose[frames] = poses.hand_pose
+        self.orient[frames] = 0.0
+        self.pose[frames] = -self.pose_bias
+        self.position.restart(poses.wrist, frames)
 
 
 class PoseErrors(NamedTuple):

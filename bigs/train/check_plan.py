@@ -7,9 +7,11 @@ from itertools import pairwise
 from bigs.checks import InputError, check_choice
 from bigs.train.loop.optim import GROUPS, ONLY_FREE, ONLY_IN_FIELDS
 from bigs.train.loop.terms import terms_of
+from bigs.train.moves.trials import PRICED, RATED
 from bigs.train.plan.config import (
     CompletionStage,
     GuidanceStage,
+    MoveStage,
     ObjectMotionStage,
     OptimizeStage,
     RefineStage,
@@ -51,6 +53,11 @@ def check_plan(config: RunConfig) -> None:
                     raise InputError(f"{where}: expected {name} with step single-subject, found {stage.step}")
             if stage.densify is not None:
                 _check_densify(f"{where}.densify", stage, stage.densify, config.stages)
+        elif isinstance(stage, MoveStage):
+            for group in stage.lrs:
+                check_choice(where, group, RATED, "groups")
+            for term in stage.weights:
+                check_choice(where, term, PRICED, "terms")
     _check_parameters(config)
     for name, (*others, last) in COMPILED.items():
         value = getattr(config.raster, name)

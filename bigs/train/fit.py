@@ -29,10 +29,12 @@ from bigs.train.loop.refinement import refined
 from bigs.train.loop.run_stage import StageProgress, StageState, run_stage
 from bigs.train.loop.stopwatch import Stopwatch
 from bigs.train.loop.target_source import TargetSource
+from bigs.train.moves.search import search_moves
 from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    MoveStage,
     ObjectMotionStage,
     OptimizeStage,
     RefineStage,
@@ -192,6 +194,10 @@ def fit(
             for side, found in grasps.items():
                 text = f"{side} hand holds the object in frames {found.text()}"
                 listen({"event": "note", "stage": stage.name, "text": text})
+        elif isinstance(stage, MoveStage):
+            moved = search_moves(scene, stage, sources.evidence(stage), sources.mismatch(stage))
+            for side, moves in moved.items():
+                listen({"event": "note", "stage": stage.name, "text": f"{side} hand: {moves.text()}"})
         elif isinstance(stage, SplitStage):
             for text in _split(scene, stage, sources):
                 listen({"event": "note", "stage": stage.name, "text": text})
@@ -232,7 +238,7 @@ def _image_sizes(stages: Sequence[Stage]) -> list[int]:
     """The sizes at which stages look at the clip's images, in their order."""
     sizes = []
     for stage in stages:
-        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage | RefineStage):
+        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage | MoveStage | RefineStage):
             sizes.append(stage.image_size)
         elif not isinstance(stage, ObjectMotionStage):
             sizes.append(OBSERVED_AT.image_size)
@@ -334,6 +340,8 @@ def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
         return None
     if isinstance(stage, CompletionStage | GuidanceStage | RefineStage) and scene.object_splats is None:
         return "the clip has no object"
+    if isinstance(stage, MoveStage):
+        return None if scene.sides else "the clip has no hand"
     if isinstance(stage, CompletionStage | RefineStage):
         return None
     if isinstance(stage, GuidanceStage):

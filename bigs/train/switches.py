@@ -12,6 +12,7 @@ from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    MoveStage,
     ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
@@ -79,12 +80,20 @@ def without_all(config: RunConfig, names: Iterable[str]) -> tuple[RunConfig, lis
 
 def _terms(*names: str) -> Callable[[RunConfig], RunConfig]:
     """Leave out loss terms."""
-    return lambda config: _keep(config, lambda stage: replace(stage, weights=_less(stage.weights, names)))
+
+    def less(stage: OptimizeStage | MoveStage) -> Stage:
+        return replace(stage, weights=_less(stage.weights, names))
+
+    return lambda config: _keep(config, less, change_moves=less)
 
 
 def _groups(*names: str) -> Callable[[RunConfig], RunConfig]:
     """Freeze parameters."""
-    return lambda config: _keep(config, lambda stage: replace(stage, lrs=_less(stage.lrs, names)))
+
+    def less(stage: OptimizeStage | MoveStage) -> Stage:
+        return replace(stage, lrs=_less(stage.lrs, names))
+
+    return lambda config: _keep(config, less, change_moves=less)
 
 
 def _less(values: dict[str, float], names: Iterable[str]) -> dict[str, float]:
@@ -93,19 +102,25 @@ def _less(values: dict[str, float], names: Iterable[str]) -> dict[str, float]:
 
 def _keep(
     config: RunConfig,
-    change: Callable[[OptimizeStage], OptimizeStage] = lambda stage: stage,
+    change: Callable[[OptimizeStage], Stage] = lambda stage: stage,
     leave_out: type[Stage] | tuple[type[Stage], ...] = (),
+    change_moves: Callable[[MoveStage], Stage] = lambda stage: stage,
 ) -> RunConfig:
     """The same with changed stages, without those of a kind and those that have nothing left to do."""
-    stages = [
-        change(stage) if isinstance(stage, OptimizeStage) else stage
-        for stage in config.stages
-        if not isinstance(stage, leave_out)
-    ]
-    idle = [
-        stage for stage in stages if isinstance(stage, OptimizeStage) and not (stage.lrs and stage.weights)
-    ]
-    return replace(config, stages=tuple(stage for stage in stages if stage not in idle))
+
+    def changed(stage: Stage) -> Stage:
+        if isinstance(stage, MoveStage):
+            return change_moves(stage)
+        return change(stage) if isinstance(stage, OptimizeStage) else stage
+
+    stages = [changed(stage) for stage in config.stages if not isinstance(stage, leave_out)]
+    return replace(config, stages=tuple(stage for stage in stages if not _is_idle(stage)))
+
+
+def _is_idle(stage: Stage) -> bool:
+    if isinstance(stage, MoveStage):
+        return not stage.lrs
+    return isinstance(stage, OptimizeStage) and not (stage.lrs and stage.weights)
 
 
 def _all_of(*steps: Callable[[RunConfig], RunConfig]) -> Callable[[RunConfig], RunConfig]:
@@ -234,6 +249,10 @@ _INGREDIENTS = {
         _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),
     ),
     "free_frames": Switch("the steps for frames between grasps", _free_frames),
+    "moves": Switch(
+        "the search for better poses between grasps",
+        lambda config: _keep(config, leave_out=MoveStage),
+    ),
     "frame_moments": Switch(
         "separate Adam moments for each frame's rotations and fingers",
         lambda config: _keep(config, lambda stage: replace(stage, frame_moments=False)),

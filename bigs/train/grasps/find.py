@@ -33,9 +33,9 @@ _ARM = 0.3
 # Pictures say more than estimates, so in the second cut half of a frame's price comes from the masks.
 _ESTIMATE_SHARE = 0.5
 
-# How badly a hand's outline in poses of all T frames disagrees with its masks: [T] squared error per pixel of
-# the hand, NaN in frames whose masks say nothing.
-Mismatch = Callable[[Side, HandFrames], Tensor]
+# How badly a hand's outline in poses of some frames [B], which may repeat, disagrees with its masks: [B]
+# squared error per pixel of the hand, NaN in frames whose masks say nothing.
+Mismatch = Callable[[Side, HandFrames, Tensor], Tensor]
 
 
 class FoundGrasps(NamedTuple):
@@ -129,7 +129,7 @@ def _search(
     costs = _estimate_costs(points, information, proposed)
     if mismatch is not None:
         # The usual disagreement of a hand in its own pose; frames with wrong estimates have more.
-        usual = float(mismatch(side, poses).nanquantile(0.25))
+        usual = float(mismatch(side, poses, torch.arange(scene.n_frames)).nanquantile(0.25))
         apart = prices.free * ~touches
         for _ in range(stage.rounds):
             hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, stage.least))
@@ -191,7 +191,8 @@ def _excess(
     of_frame[frames.start : frames.stop] = 0
     grasp.set(of_frame, 0.0, poses, carrier)
     grasp.of_frame.zero_()
-    carried = mismatch(side, HandPoses(*poses)(torch.arange(count), grasp(carrier)))
+    every = torch.arange(count)
+    carried = mismatch(side, HandPoses(*poses)(every, grasp(carrier)), every)
     return torch.nan_to_num(carried - usual, nan=0.0).double().numpy()
 
 

@@ -19,7 +19,14 @@ from bigs.train.loop.image_terms import labels
 from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.loop.targets import Targets
-from bigs.train.plan.config import GraspStage, OptimizeStage, RefineStage, RunConfig, ScaleSearchStage
+from bigs.train.plan.config import (
+    GraspStage,
+    MoveStage,
+    OptimizeStage,
+    RefineStage,
+    RunConfig,
+    ScaleSearchStage,
+)
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side
 
@@ -74,7 +81,9 @@ class EvidenceSource:
             for side, touching in self.touching().items()
         }
 
-    def evidence(self, stage: OptimizeStage | ScaleSearchStage | GraspStage | RefineStage) -> Evidence:
+    def evidence(
+        self, stage: OptimizeStage | ScaleSearchStage | GraspStage | MoveStage | RefineStage
+    ) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets.at(stage.image_size)
         silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
@@ -99,22 +108,23 @@ class EvidenceSource:
             canonical = self.scene.canonical(entities)
         return lambda: float(labels(Step(self.scene, evidence, canonical, Selection(frames, entities))))
 
-    def mismatch(self, stage: GraspStage) -> Mismatch:
-        """How badly a hand's outline, in any poses of all frames, disagrees with its masks."""
+    def mismatch(self, stage: GraspStage | MoveStage) -> Mismatch:
+        """How badly a hand's outline, in any poses, disagrees with its masks; poses get a gradient."""
         evidence = self.evidence(stage)
-        frames = torch.arange(len(self.clip))
-        step = Step(self.scene, evidence, {}, Selection(frames))
+        targets = evidence.targets
+        step = Step(self.scene, evidence, {}, Selection(torch.arange(len(self.clip))))
+        shown = targets.foreground.sum((1, 2)) > 0
+        areas = {side: targets.shares[side].sum((1, 2)) for side in self.scene.sides}
 
-        @torch.no_grad()
-        def ask(side: Side, poses: HandFrames) -> Tensor:
+        def ask(side: Side, poses: HandFrames, frames: Tensor) -> Tensor:
             posed = self.scene.posed_hand(side, poses, evidence.silhouettes[side])
             alphas = step.render(posed).alphas.squeeze(-1)
-            own, hidden = evidence.targets.shares[side], evidence.targets.hidden[side]
-            squares = (alphas - alphas.clamp(own, own + hidden)).square().sum((1, 2))
+            own, hidden = targets.shares[side][frames], targets.hidden[side][frames]
+            nearest = alphas.detach().clamp(own, own + hidden)
+            squares = (alphas - nearest).square().sum((1, 2))
             # A hand that hardly shows gives no reliable measure.
-            area = own.sum((1, 2))
-            shown = evidence.targets.foreground.sum((1, 2)) > 0
-            return torch.where(shown, squares / area.clamp_min(0.25 * area.median()), torch.nan)
+            area = areas[side].clamp_min(0.25 * areas[side].median())
+            return torch.where(shown[frames], squares / area[frames], torch.nan)
 
         return ask
 

@@ -95,6 +95,33 @@ class GraspStage:
 
 
 @dataclass(frozen=True)
+class MoveStage:
+    """Frames between grasps in a wrong pose try those of their neighbours (see `train.moves.search`)."""
+
+    name: str
+    # Rates and weights of terms, as in `OptimizeStage`, of poses on trial. A mismatch of outlines counts 1.
+    lrs: dict[str, float]
+    weights: dict[str, float]
+    step: StepKind = "single-subject"
+    image_size: int = 160
+    # Frames are tried again if their outlines disagree by more than this many times as much as usual.
+    worse: float = 2.0
+    # Radians by which neighbours' poses are turned either way: fingers lie so far apart, seen from the wrist.
+    turn: float = 0.25
+    # Steps of every trial, and the steps that then follow for so many of each frame's best.
+    steps: tuple[int, int] = (15, 30)
+    best: int = 2
+    # A trial must bring the price below this share of what it was; and how often frames try.
+    gain: float = 0.9
+    rounds: int = 6
+    # At most so many frames at either end of a grasp may leave it: if the outline disagrees by more than
+    # `loose` times as much as usual, and the price of another pose is below `loose_gain` of that.
+    loose_frames: int = 2
+    loose: float = 2.5
+    loose_gain: float = 0.5
+
+
+@dataclass(frozen=True)
 class ObjectMotionStage:
     """The object's motion from tracks in its pictures, found before anything is built on it.
 
@@ -229,6 +256,7 @@ Stage = (
     | ObjectMotionStage
     | ScaleSearchStage
     | GraspStage
+    | MoveStage
     | SplitStage
     | RefineStage
     | CompletionStage

@@ -9,6 +9,7 @@ from bigs.train.plan.config import (
     CompletionStage,
     GraspStage,
     GuidanceStage,
+    MoveStage,
     ObjectMotionStage,
     OptimizeStage,
     PriorConfig,
@@ -21,15 +22,8 @@ from bigs.train.plan.paper import PAPER
 from bigs.train.plan.start_config import InitialConfig
 
 # What keeps hand poses plausible while silhouettes move them. Angles in radians, joints in centimetres.
-_POSE_PRIORS = {
-    "betas_prior": 0.01,
-    "pose_prior": 1.0,
-    "fingers_even": 0.3,
-    "joint_axes": 12.0,
-    "finger_tendons": 0.6,
-    "orient_prior": 0.1,
-    "acceleration": 0.005,
-}
+_FINGER_PRIORS = {"pose_prior": 1.0, "fingers_even": 0.3, "joint_axes": 12.0, "finger_tendons": 0.6}
+_POSE_PRIORS = {"betas_prior": 0.01, **_FINGER_PRIORS, "orient_prior": 0.1, "acceleration": 0.005}
 # Grasps average over frames, so their estimates count more. The four priors on fingers keep their ratios:
 # those in which a regressor's errors (12 degrees), the unevenness of fingers, turns about axes that a joint
 # does not have (4 degrees, since a model's axes are not exactly a hand's), and bends that tendons do not make
@@ -132,6 +126,12 @@ _APPEARANCE = OptimizeStage(
     frames_per_step=6,
 )
 
+# What steps from a frame's own start cannot mend.
+_MOVES = MoveStage(
+    name="moves",
+    lrs={"hand.orient": 0.02, "hand.pose": 0.03, "hand.ray": 0.004, "hand.depth": 0.006},
+    weights={**_FINGER_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
+)
 # Between grasps nothing carries a hand, and a few frames decide: many steps for them alone. Their depth is
 # read off the size of outlines, which must be right to a fraction of a per cent (see `evidence.INSET`).
 _REGRASP = OptimizeStage(
@@ -261,6 +261,7 @@ FAST = RunConfig(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
+        _MOVES,
         _REGRASP,
         _FREED,
         _JOINT,
@@ -283,6 +284,7 @@ DEMO = replace(
         replace(_APPEARANCE, steps=40),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
+        _MOVES,
         replace(_REGRASP, steps=60),
         SplitStage(),
         replace(_JOINT, steps=110),
@@ -313,6 +315,7 @@ FULL = replace(
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
+        _MOVES,
         _REGRASP,
         _FREED,
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
@@ -344,6 +347,7 @@ SMOKE = replace(
         replace(_GRASPED, steps=8, image_size=80),
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
+        replace(_MOVES, steps=(3, 3), image_size=80, rounds=2),
         replace(_REGRASP, steps=8, image_size=80),
         _FREED,
         # Too few steps for frames to get anywhere on their own.

@@ -21,6 +21,7 @@ from bigs.raster.settings import RasterSettings
 from bigs.train.plan.config import (
     GraspStage,
     GuidanceStage,
+    MoveStage,
     OpeningConfig,
     OptimizeStage,
     RefineStage,
@@ -112,6 +113,7 @@ RANGES: dict[type, dict[str, Range]] = {
         **dict.fromkeys(("free", "excess", "error_aside", "error_along"), _POSITIVE),
         "image_size": _PIXELS,
     },
+    MoveStage: {"image_size": _PIXELS, "best": _COUNT, "gain": _SHARE, "loose_gain": _SHARE},
     TrackerConfig: {
         "overlap": _COUNT,
         "turn_sigma": _POSITIVE,

@@ -112,7 +112,7 @@ def test_pictures_give_a_grasp_the_frames_that_faulty_estimates_lost() -> None:
     with torch.no_grad():
         scene.hand_poses["right"].position.restart(true + wrong)
 
-    def mismatch(side: Side, poses: HandFrames) -> torch.Tensor:
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
         return (poses.wrist - truth.at(ALL).hand(side).wrist).norm(dim=-1) / 0.01
 
     alone = find_grasps(copy.deepcopy(scene), STAGE, EVERYWHERE)["right"]
@@ -131,7 +131,7 @@ def test_pictures_drop_a_grasp_that_they_contradict() -> None:
     scene = turning_scene(wander=0.0008)
     touching = {"right": torch.ones(FRAMES), "left": torch.ones(FRAMES)}
 
-    def mismatch(side: Side, poses: HandFrames) -> torch.Tensor:
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
         carried = not torch.equal(poses.wrist, scene.at(ALL).hand(side).wrist)
         return torch.full((FRAMES,), 2.0 if carried and side == "left" else 0.02)
 
