@@ -24,7 +24,7 @@ from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
 from bigs.train.loop.step import Evidence
-from bigs.train.moves.trials import Trials, Tried, poses_at
+from bigs.train.moves.trials import Trials, Tried, poses_at, poses_together
 from bigs.train.plan.config import MoveStage
 from bigs.types import Side
 
@@ -134,7 +134,7 @@ class _Search:
         if not frames:
             return False
         places = torch.tensor(frames)
-        rough = self._trials.fit(places, _together(starts), self._stage.steps[0])
+        rough = self._trials.fit(places, poses_together(starts), self._stage.steps[0])
         best = torch.cat([_cheapest(rough.price, places == frame, self._stage.best) for frame in set(frames)])
         places = places[best]
         fine = self._trials.fit(places, rough.at(best).poses, self._stage.steps[1])
@@ -170,7 +170,7 @@ class _Search:
         if not 0 < frame < len(self._now.price) - 1:
             return torch.zeros(())
         before, after = (poses_at(self._now.poses, torch.tensor([frame + step])) for step in (-1, 1))
-        three = _together([before, poses, after])
+        three = poses_together([before, poses, after])
         wrist = mirror_points(three.wrist) if self._side == "left" else three.wrist
         model, betas = self._scene.hand_model(self._side), self._scene.hand_betas(self._side)
         return acceleration(model.skeleton(betas, three.hand_pose, three.global_orient, wrist).joints)
@@ -189,10 +189,6 @@ class _Search:
         own.expected_log_depth[let_go] = carried_wrists[let_go, 2].log()
         renewed = torch.tensor(sorted(self._renewed), dtype=torch.long)
         own.restart_frames(renewed, poses_at(self._now.poses, renewed))
-
-
-def _together(poses: list[HandFrames]) -> HandFrames:
-    return HandFrames(*(torch.cat(parts) for parts in zip(*poses, strict=True)))
 
 
 def _cheapest(prices: Tensor, among: Tensor, most: int) -> Tensor:

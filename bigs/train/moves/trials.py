@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -22,6 +23,8 @@ from bigs.types import Side
 RATED = ("hand.orient", "hand.pose", "hand.ray", "hand.depth")
 _PRIORS = ("pose_prior", "fingers_even", "joint_axes", "finger_tendons", "depth_prior")
 PRICED = (*_PRIORS, "acceleration")
+# Trials that are rendered together: more of them would take memory, but no less time.
+_TOGETHER = 96
 # Rates fall to this share.
 _FINAL_RATE = 0.2
 # Adam's: so few steps would hardly forget the first.
@@ -68,6 +71,15 @@ class Trials:
 
     def fit(self, frames: Tensor, starts: HandFrames, steps: int) -> Tried:
         """Poses that `steps` steps reach from N starts, each in its own of `frames` [N], which may repeat."""
+        batches = torch.arange(len(frames)).split(_TOGETHER)
+        tried = [self._fit(frames[batch], poses_at(starts, batch), steps) for batch in batches]
+        return Tried(
+            poses_together([one.poses for one in tried]),
+            torch.cat([one.mismatch for one in tried]),
+            torch.cat([one.price for one in tried]),
+        )
+
+    def _fit(self, frames: Tensor, starts: HandFrames, steps: int) -> Tried:
         moving = HandPoses(*(part.detach() for part in starts))
         all_of_them = torch.arange(len(frames))
         moved = (moving.orient, moving.pose, moving.position.ray, moving.position.log_depth)
@@ -109,6 +121,11 @@ class Trials:
 def poses_at(poses: HandFrames, places: Tensor) -> HandFrames:
     """Some of N poses, by their indices."""
     return HandFrames(*(part[places] for part in poses))
+
+
+def poses_together(poses: Iterable[HandFrames]) -> HandFrames:
+    """Poses one after another."""
+    return HandFrames(*(torch.cat(parts) for parts in zip(*poses, strict=True)))
 
 
 def _one_by_one(frames: Tensor) -> list[tuple[Tensor, Tensor]]:

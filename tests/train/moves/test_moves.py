@@ -192,6 +192,20 @@ def test_a_single_frame_is_left_alone(both_hands: Mapping[Side, HandModel]) -> N
     assert all(moved == (1, 0, []) for moved in found.values())
 
 
+def test_trials_know_nothing_of_each_other(waving: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources = pictures_of(waving)
+    for frame in (1, 3, 4):
+        a_finger_over(waving, "left", frame)
+    frames = torch.tensor([1, 3, 3, 4])
+    starts = waving.at(torch.tensor([1, 2, 3, 5])).hand("left")
+    trials = Trials(waving, "left", STAGE, sources.evidence(STAGE), sources.mismatch(STAGE))
+    together = trials.fit(frames, starts, 5)
+    monkeypatch.setattr("bigs.train.moves.trials._TOGETHER", 1)
+    alone = trials.fit(frames, starts, 5)
+    for one, other in zip((*together.poses, *together[1:]), (*alone.poses, *alone[1:]), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
 def test_prices_add_up(waving: Scene) -> None:
     """A pose on trial pays for the mismatch and for each prior by its weight."""
     sources = pictures_of(waving)
