@@ -1,10 +1,10 @@
 """Frames between grasps that are caught in a wrong pose try those of their neighbours.
 
 Each of them is fitted to its own picture. From a poor start that ends in a pose from which every small step
-is worse: mostly a finger lies where its neighbour belongs. The outline then stays wrong, though often right
-beside a frame in which it is right. So poses spread: a wrong frame tries those of its neighbours, as they are
-and turned in the palm's plane by a finger's width either way, and takes one that suits picture and motion
-better. The frames beyond it may go on from there.
+is worse: mostly a finger lies where its neighbour belongs. The outline then stays wrong, often next to a
+frame in which it is right. So poses spread: a wrong frame tries its own and those of its neighbours,
+as they are and turned in the palm's plane by a finger's width either way, and takes one that suits picture
+and motion better. The frames beyond it may go on from there.
 
 A grasp's first or last frames may belong to the move beside it. Where the carried hand does not suit the
 picture and another one does by far, the grasp lets go of them.
@@ -129,7 +129,7 @@ class _Search:
                 if 0 <= source < len(mismatch) and mismatch[source] < _BETTER * mismatch[frame]:
                     starts += self._starts(source, (0.0, 1.0, -1.0))
             if first:
-                starts += self._starts(frame, (1.0, -1.0))
+                starts += self._starts(frame, (0.0, 1.0, -1.0))
             frames += [frame] * (len(starts) - len(frames))
         if not frames:
             return False
