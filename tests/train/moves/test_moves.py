@@ -90,7 +90,9 @@ def test_a_hand_with_fingers_where_their_neighbours_belong_is_found_again(waving
     a_finger_over(waving, side, 3)
     evidence, mismatch = sources.evidence(STAGE), sources.mismatch(STAGE)
     at = torch.tensor([3])
-    stuck = Trials(waving, side, STAGE, evidence, mismatch).fit(at, waving.at(at).hand(side), sum(STAGE.steps))
+    stuck = Trials(waving, side, STAGE, evidence, mismatch).fit(
+        at, waving.at(at).hand(side), sum(STAGE.steps)
+    )
     found = search_moves(waving, STAGE, evidence, mismatch)
     assert found[side] == (FRAMES, 1, [])
     now = mismatch(side, waving.at(at).hand(side), at)
