@@ -134,10 +134,10 @@ class _Search:
         if not frames:
             return False
         places = torch.tensor(frames)
-        rough = self._trials.fit(places, poses_together(starts), self._stage.steps[0])
+        rough = self._trials.fit(places, poses_together(starts), self._stage.trial_steps[0])
         best = torch.cat([_cheapest(rough.price, places == frame, self._stage.best) for frame in set(frames)])
         places = places[best]
-        fine = self._trials.fit(places, rough.at(best).poses, self._stage.steps[1])
+        fine = self._trials.fit(places, rough.at(best).poses, self._stage.trial_steps[1])
         taken = [
             self._take(frame, fine.at(torch.tensor([place]))) for place, frame in enumerate(places.tolist())
         ]

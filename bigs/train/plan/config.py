@@ -109,7 +109,7 @@ class MoveStage:
     # Radians by which neighbours' poses are turned either way: fingers lie so far apart, seen from the wrist.
     turn: float = 0.25
     # Steps of every trial, and the steps that then follow for so many of each frame's best.
-    steps: tuple[int, int] = (15, 30)
+    trial_steps: tuple[int, int] = (15, 30)
     best: int = 2
     # A trial must bring the price below this share of what it was; and how often frames try.
     gain: float = 0.9

@@ -347,7 +347,7 @@ SMOKE = replace(
         replace(_GRASPED, steps=8, image_size=80),
         replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
-        replace(_MOVES, steps=(3, 3), image_size=80, rounds=2),
+        replace(_MOVES, trial_steps=(3, 3), image_size=80, rounds=2),
         replace(_REGRASP, steps=8, image_size=80),
         _FREED,
         # Too few steps for frames to get anywhere on their own.

@@ -91,7 +91,7 @@ def test_a_hand_with_fingers_where_their_neighbours_belong_is_found_again(waving
     evidence, mismatch = sources.evidence(STAGE), sources.mismatch(STAGE)
     at = torch.tensor([3])
     stuck = Trials(waving, side, STAGE, evidence, mismatch).fit(
-        at, waving.at(at).hand(side), sum(STAGE.steps)
+        at, waving.at(at).hand(side), sum(STAGE.trial_steps)
     )
     found = search_moves(waving, STAGE, evidence, mismatch)
     assert found[side] == (FRAMES, 1, [])
