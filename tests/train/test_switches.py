@@ -11,7 +11,14 @@ from bigs.checks import InputError
 from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.check_plan import check_plan
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
-from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, ScaleSearchStage, SplitStage
+from bigs.train.plan.config import (
+    GraspStage,
+    MoveStage,
+    OptimizeStage,
+    RunConfig,
+    ScaleSearchStage,
+    SplitStage,
+)
 from bigs.train.plan.presets import PRESETS
 from bigs.train.switches import SWITCHES, without, without_all
 
@@ -117,3 +124,17 @@ def test_a_plan_does_not_become_empty() -> None:
     plan = RunConfig(object=ObjectSplatsConfig(), stages=(only, ScaleSearchStage()))
     with pytest.raises(InputError, match="--without silhouette: expected at least one stage to remain"):
         without_all(plan, ["silhouette"])
+
+
+def test_leaving_out_parts_of_the_search_between_grasps() -> None:
+    """The search has the rates and priors of stages, so it does without those that they do without."""
+
+    def search(*names: str) -> MoveStage | None:
+        stages = without_all(FAST, names)[0].stages
+        return next((stage for stage in stages if isinstance(stage, MoveStage)), None)
+
+    assert search() is not None and search("moves") is None
+    assert search("pose_priors").weights == {"acceleration": search().weights["acceleration"]}
+    assert "acceleration" not in search("smooth").weights
+    assert "finger_tendons" not in search("finger_tendons").weights
+    assert search("frame_poses") is None, "nothing is left that may move"

@@ -208,6 +208,76 @@ def test_trials_know_nothing_of_each_other(waving: Scene, monkeypatch: pytest.Mo
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 
 
+def only_frame_3(asked: Mismatch) -> Mismatch:
+    """What pictures say of frame 3, and nothing of the others."""
+
+    def mismatch(side: Side, poses: HandFrames, frames: Tensor) -> Tensor:
+        return torch.where(frames == 3, asked(side, poses, frames), torch.where(frames == 0, 0.0, torch.nan))
+
+    return mismatch
+
+
+def test_a_frame_without_neighbours_to_learn_from_turns_its_own_pose(waving: Scene) -> None:
+    truth, sources = copy.deepcopy(waving), pictures_of(waving)
+    a_finger_over(waving, "right", 3)
+    mismatch = only_frame_3(sources.mismatch(STAGE))
+    unturned = copy.deepcopy(waving)
+    search_moves(waving, STAGE, sources.evidence(STAGE), mismatch)
+    assert angles(waving, truth, "right")[3] < 0.05
+    search_moves(unturned, replace(STAGE, turn=0.0), sources.evidence(STAGE), mismatch)
+    assert angles(unturned, truth, "right")[3] > 0.1
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rounds": 0}, {"worse": 1e6}, {"gain": 0.0}, {"weights": {"acceleration": 1e6}}]
+)
+def test_settings_that_stop_frames_from_trying(waving: Scene, changes: dict) -> None:
+    """A hand that jerks in one picture is followed there unless a setting speaks against it."""
+    jerking = copy.deepcopy(waving)
+    a_finger_over(jerking, "right", 3)
+    sources = pictures_of(jerking)
+    asked, evidence = sources.mismatch(STAGE), sources.evidence(STAGE)
+
+    def mismatch(side: Side, poses: HandFrames, frames: Tensor) -> Tensor:
+        return asked(side, poses, frames) + 0.002  # masks are never quite right
+
+    stopped = search_moves(copy.deepcopy(waving), replace(STAGE, **changes), evidence, mismatch)
+    assert stopped["right"].renewed == 0
+    assert search_moves(waving, STAGE, evidence, mismatch)["right"].renewed == 1
+
+
+@pytest.mark.parametrize("changes", [{"loose_frames": 0}, {"loose": 1e6}, {"loose_gain": 0.0}])
+def test_settings_that_keep_a_grasp_whole(waving: Scene, changes: dict) -> None:
+    with torch.no_grad():
+        waving.hand_poses["right"].base_orient[:5] = waving.hand_poses["right"].base_orient[:1].clone()
+        waving.hand_poses["right"].base_orient[5] = waving.hand_poses["right"].base_orient[6]
+    sources = pictures_of(waving)
+    of_frame = torch.tensor([0, 0, 0, 0, 0, 0, -1])
+    waving.grasps["right"].set(of_frame, 0.0, waving.at(ALL).hand("right"), still(waving))
+    stage = replace(STAGE, **changes)
+    found = search_moves(waving, stage, sources.evidence(stage), sources.mismatch(stage))
+    assert found["right"].let_go == [] and waving.grasps["right"].of_frame.tolist() == of_frame.tolist()
+
+
+def test_trials_take_the_steps_and_the_best_that_the_stage_names(
+    waving: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = pictures_of(waving)
+    a_finger_over(waving, "right", 3)
+    asked: list[tuple[int, int]] = []
+    fit = Trials.fit
+
+    def watched(self: Trials, frames: Tensor, starts: HandFrames, steps: int) -> object:
+        asked.append((len(frames), steps))
+        return fit(self, frames, starts, steps)
+
+    monkeypatch.setattr(Trials, "fit", watched)
+    stage = replace(STAGE, trial_steps=(2, 3), best=4, rounds=1)
+    search_moves(waving, stage, sources.evidence(stage), sources.mismatch(stage))
+    # Both neighbours and the frame itself, each turned three ways.
+    assert asked == [(9, 2), (4, 3)]
+
+
 def test_prices_add_up(waving: Scene) -> None:
     """A pose on trial pays for the mismatch and for each prior by its weight."""
     sources = pictures_of(waving)
