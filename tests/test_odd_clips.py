@@ -113,5 +113,5 @@ def test_it_ends_well(tiny_clip: Path, tmp_path: Path, make_odd: Callable[[OddCl
     told = any("no frame shows the object" in line for line in outcome.report.skipped)
     assert told == (make_odd is nothing_is_labelled)
     if make_odd is both_are_behind_the_camera_once:
-        assert "object: behind the camera in frame 4" in outcome.report.facts["estimates"]
-        assert "right hand: behind the camera in 2 frames (7, 8)" in outcome.report.facts["estimates"]
+        assert "object: behind the camera in frame 4" in outcome.report.facts["clip"]
+        assert "right hand: behind the camera in 2 frames (7, 8)" in outcome.report.facts["clip"]

@@ -84,6 +84,7 @@ class Clip:
     annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right
+    gains: np.ndarray | None = None  # [T, 3] how many times as bright as usual the files' channels are
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:
@@ -93,10 +94,12 @@ class Clip:
         return len(self.image_paths)
 
     def image(self, t: int) -> np.ndarray:
-        """Frame `t`, [H, W, 3] uint8 RGB."""
+        """Frame `t`, [H, W, 3] uint8 RGB, in the clip's usual exposure."""
         if self.optics is None:
-            return read_image(self.image_paths[t], (self.width, self.height))
-        return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
+            found = read_image(self.image_paths[t], (self.width, self.height))
+        else:
+            found = self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
+        return found if self.gains is None else _divided(found, self.gains[t])
 
     def mask(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""
@@ -109,3 +112,9 @@ class Clip:
     def has_pixels(self, entity: Entity) -> np.ndarray:
         """In which frames the masks show `entity`, [T] bool."""
         return self.mask_areas[entity] > 0
+
+
+def _divided(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """An image [H, W, 3] uint8 with its channels divided by a gain [3]."""
+    table = (np.arange(256)[:, None] / gain).round().clip(0, 255).astype(np.uint8)
+    return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)

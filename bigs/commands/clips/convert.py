@@ -64,7 +64,8 @@ def convert(
     if plan.every < 1 or plan.width < 0:
         raise InputError(f"--every, --width: expected at least 1 and 0, found {plan.every} and {plan.width}")
     hand_models = load_hand_models(hand_model)
-    clip = open_clip(source, hand_models)
+    # Pictures go on as they were taken; whatever opens the new clip brings them to one exposure.
+    clip = replace(open_clip(source, hand_models), gains=None)
     if clip.annotated and not plan.from_truth:
         raise InputError(
             f"{source}: expected a clip with initial estimates, found a data set's ground truth "

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.data.exposure import with_one_exposure
 from bigs.data.formats.layouts import load_clip
 from bigs.data.plausible import plausible
 from bigs.data.swapped_labels import with_labels_sorted
@@ -26,7 +27,8 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
     clip = plausible(clip, wrists)
     if clip.annotated:
         return clip
-    return with_labels_sorted(clip, initial_trajectory(clip, hand_models).joints)
+    clip = with_labels_sorted(clip, initial_trajectory(clip, hand_models).joints)
+    return with_one_exposure(clip)
 
 
 def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:

@@ -145,7 +145,7 @@ def reconstruct(
             report.skipped[:0] = resolved.notes
             watch.begin("results")
             if clip.notes:
-                report.facts["estimates"] = "; ".join(clip.notes)
+                report.facts["clip"] = "; ".join(clip.notes)
             playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)

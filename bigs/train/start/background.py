@@ -3,9 +3,8 @@
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
 background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
 most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
-colours, the one that the clip's occluders have elsewhere belongs to an occluder. Where the exposure wavers,
-images are brought to one exposure first. Before a background that moves nothing is known but which masks were
-lost: what they showed may still be there.
+colours, the one that the clip's occluders have elsewhere belongs to an occluder. Before a background that
+moves nothing is known but which masks were lost: what they showed may still be there.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 import scipy.ndimage
 
 from bigs.data.base import Clip
+from bigs.data.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
 from bigs.types import MASK_VALUES
@@ -36,8 +36,6 @@ _NEIGHBOURHOOD = 2.0
 _MOVED = 10
 # Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
-# Exposures that differ by less are the same, and what is darker than this says nothing of them.
-_STEADY, _DARK = 0.02, 0.1
 # If more of the background moves than this, the camera moves or the light changes, and nothing is known.
 _USELESS_SHARE = 0.5
 
@@ -53,12 +51,7 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
     images = np.stack(side_by_side(lambda t: clip.image(t)[::step, ::step], frames))
     labels = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames))
     background = labels == 0
-    looks = _looks(images, background)
-    gains = _gains(images, background, looks.usual)
-    if (gains != 1.0).any():
-        images = np.stack([_divided(image, gain) for image, gain in zip(images, gains, strict=True)])
-        looks = _looks(images, background)
-    still = _still_background(looks)
+    still = _still_background(_looks(images, background))
     # A frame at a time: the whole clip in floats is large.
     unknown = (
         np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
@@ -100,24 +93,6 @@ def _lost(labels: np.ndarray) -> np.ndarray:
     return lost & (labels == 0)
 
 
-def _gains(images: np.ndarray, background: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """The exposure [T] of images [T, H, W, 3] relative to their background's usual look [H, W, 3].
-
-    It is the median over pixels, of which occluders cover less than half; 1 where it is about that.
-    """
-    bright = usual.mean(-1) > _DARK
-    gains = np.ones(len(images))
-    for t, image in enumerate(images):
-        chosen = background[t] & bright
-        if chosen.any():
-            gains[t] = np.median(_floats(image[chosen]).mean(-1) / usual[chosen].mean(-1))
-    return np.where(np.abs(gains - 1.0) > _STEADY, gains, 1.0)
-
-
-def _divided(image: np.ndarray, gain: float) -> np.ndarray:
-    return image if gain == 1.0 else (image / gain + 0.5).clip(0.0, 255.0).astype(np.uint8)
-
-
 class _Looks(NamedTuple):
     """What each pixel shows where the masks say background; colours in [0, 1]."""
 
@@ -137,21 +112,11 @@ def _looks(images: np.ndarray, background: np.ndarray) -> _Looks:
     differs = np.zeros(background.shape, dtype=bool)
     for row in range(images.shape[1]):  # a row at a time: the medians' copies in floats are large
         values = np.where(background[:, row, :, None], _floats(images[:, row]), np.float32(np.nan))
-        usual[row] = _median(values)
+        usual[row] = median_over_time(values)
         differs[:, row] = (np.abs(values - usual[row]) > _THRESHOLD).any(axis=-1)
-        other[row] = _median(np.where(differs[:, row, :, None], values, np.float32(np.nan)))
+        other[row] = median_over_time(np.where(differs[:, row, :, None], values, np.float32(np.nan)))
     other_frames = differs.sum(axis=0)
     return _Looks(usual, other, background.sum(axis=0) - other_frames, other_frames)
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Median [W, 3] over time of values [T, W, 3] without those that are NaN; 0 where all are."""
-    # NaN comes last; `nanmedian` takes several times as long.
-    ordered = np.sort(values, axis=0)
-    count = (~np.isnan(values)).sum(axis=0)
-    middle = [np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)]
-    lower, upper = (np.take_along_axis(ordered, index[None], axis=0)[0] for index in middle)
-    return np.where(count > 0, (lower + upper) / 2, np.zeros((), dtype=values.dtype))
 
 
 def _still_background(looks: _Looks) -> np.ndarray:

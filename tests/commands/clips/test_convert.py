@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from PIL import Image
 from bigs.checks import InputError
 from bigs.commands.clips import convert as converting
 from bigs.commands.clips.convert import ConvertPlan, convert
+from bigs.commands.clips.open import open_clip
 from bigs.commands.clips.truth import load_truth, pose_annotation
 from bigs.data.base import Clip
 from bigs.data.formats.hold import load_hold
 from bigs.data.formats.writers import write_arctic
 from bigs.data.ground_truth import load_annotation
-from bigs.hand import HandModel
+from bigs.hand import HandModel, load_hand_models
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side
 
@@ -145,3 +147,19 @@ def test_what_is_refused(call: Callable[..., Answer], tmp_path: Path, arctic: Pa
     assert call("reconstruct", arctic, "--out", tmp_path / "run", "--preset", "smoke").code == 2
     with pytest.raises(InputError, match="expected a clip folder"):
         convert(tmp_path / "absent", tmp_path / "new", ConvertPlan())
+
+
+def test_pictures_of_a_wavering_exposure_go_on_as_they_are(tmp_path: Path, tiny_clip: Path) -> None:
+    source = Path(shutil.copytree(tiny_clip, tmp_path / "source"))
+    files = sorted((source / "build" / "image").iterdir())
+    for t in (2, 5):
+        Image.fromarray((0.8 * np.array(Image.open(files[t]))).astype(np.uint8)).save(files[t])
+    models = load_hand_models(None)
+    opened = open_clip(source, models)
+    assert opened.gains is not None
+    assert np.flatnonzero((np.abs(opened.gains - 1.0) > 0.05).any(1)).tolist() == [2, 5]
+    convert(source, tmp_path / "clip", ConvertPlan())
+    for t, (before, after) in enumerate(
+        zip(files, sorted((tmp_path / "clip" / "build" / "image").iterdir()), strict=True)
+    ):
+        np.testing.assert_array_equal(np.array(Image.open(before)), np.array(Image.open(after)), str(t))

@@ -9,6 +9,7 @@ import pytest
 import scipy.ndimage
 from toy_clips import painted_clip
 
+from bigs.data.exposure import with_one_exposure
 from bigs.train.start.background import unknown_occluders
 
 FRAMES, HEIGHT, WIDTH = 9, 60, 80
@@ -60,7 +61,7 @@ def test_exposure_that_wavers_hides_no_background(tmp_path: Path, rng: np.random
     images[sleeve] = [0.1, 0.15, 0.9]
     gains = rng.uniform(0.8, 1.2, FRAMES)[:, None, None, None]
     clip = painted_clip(tmp_path, to_bytes(gains * images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    found = unknown_occluders(clip)
+    found = unknown_occluders(with_one_exposure(clip))
     assert found[sleeve].mean() > 0.95
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 7, 7)))
     assert found[~near].mean() < 0.01
