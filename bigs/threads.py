@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import torch
 
@@ -22,6 +22,23 @@ def limit_threads(threads: int) -> None:
 def thread_count() -> int:
     """How many threads work that is given to another library may take: as many as torch has."""
     return torch.get_num_threads()
+
+
+class _Caller(Executor):
+    """Does its work where it is submitted."""
+
+    def submit(self, function: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
+        done: Future[R] = Future()
+        try:
+            done.set_result(function(*args, **kwargs))
+        except Exception as error:  # whoever asks for the result gets it
+            done.set_exception(error)
+        return done
+
+
+def beside(workers: int = 1) -> Executor:
+    """Workers beside the caller; with one thread the caller does their work as it submits it."""
+    return ThreadPoolExecutor(workers) if thread_count() > 1 else _Caller()
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], threads: int | None = None) -> list[R]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from PIL import Image
 from bigs.checks import MAX_PIXELS, InputError, check_pixels, found_at
 from bigs.files import open_regular
 from bigs.names import check_name
+from bigs.threads import side_by_side
 from bigs.types import ENTITIES, MASK_VALUES, Entity
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -141,9 +141,8 @@ def decode_frames(
         counts = np.bincount(read_mask(mask, size).ravel(), minlength=256)
         return [int(counts[MASK_VALUES[entity]]) for entity in ENTITIES]
 
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(check, image_paths))
-        counts = list(pool.map(areas, mask_paths)) or [[0] * len(ENTITIES)] * len(image_paths)
+    side_by_side(check, image_paths)
+    counts = side_by_side(areas, mask_paths) or [[0] * len(ENTITIES)] * len(image_paths)
     table = np.array(counts)
     return {entity: table[:, column] for column, entity in enumerate(ENTITIES)}
 

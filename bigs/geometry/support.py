@@ -10,6 +10,7 @@ import scipy.spatial
 from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.geometry.mesh import sample_surface
 from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.threads import thread_count
 
 # Number of surface samples that are tested, and of those that may occlude them.
 _SAMPLES, _OCCLUDERS = 4000, 20_000
@@ -80,7 +81,7 @@ class Support:
         """
         corners = grid.points()
         values = grid.values.ravel().copy()
-        guessed = self._of_sample[self._samples.query(corners, workers=-1)[1]] >= reach
+        guessed = self._of_sample[self._samples.query(corners, workers=thread_count())[1]] >= reach
         beyond = self._shown.query(corners[guessed])[0] - reach
         values[guessed] = np.maximum(values[guessed], beyond)
         return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)

@@ -17,6 +17,7 @@ import scipy.spatial
 import skimage.measure
 
 import bigs.fused.shape as fused
+from bigs.threads import thread_count
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ def plane_scatter(points: np.ndarray, normals: np.ndarray, neighbours: int = 8) 
     count = min(neighbours, len(points) - 1)
     if count < 1:
         return 0.0
-    _, index = scipy.spatial.cKDTree(points).query(points, k=count + 1, workers=-1)
+    _, index = scipy.spatial.cKDTree(points).query(points, k=count + 1, workers=thread_count())
     others = index[:, 1:]
     off = ((points[:, None] - points[others]) * normals[others]).sum(-1).mean(1)
     # The mean of the planes scatters, too.
@@ -207,7 +208,7 @@ def blend_with_points(
     # Far outside only the sign matters, and it is known.
     near = np.flatnonzero(values < reach)
     distance, index = scipy.spatial.cKDTree(points).query(
-        corners[near], k=min(neighbours, len(points)), distance_upper_bound=reach, workers=-1
+        corners[near], k=min(neighbours, len(points)), distance_upper_bound=reach, workers=thread_count()
     )
     has = np.isfinite(distance[:, 0])
     near, distance, index = near[has], distance[has], index[has]

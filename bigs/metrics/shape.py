@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 
 from bigs.checks import InputError, check_shape
 from bigs.fused.nearest import NearestPoints
+from bigs.threads import beside, thread_count
 
 # The evaluators draw this many vertices of each set in every frame (vertices, not surface samples).
 POINTS_PER_FRAME = 3000
@@ -79,7 +80,7 @@ def relative_scores(
     generator = torch.Generator().manual_seed(seed)
     waiting: list[Future[ShapeScore] | None] = []
     # Draws depend on each other, scores do not, and searching for neighbours needs no interpreter.
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with beside(thread_count()) as pool:
         for t in range(len(gt_object)):
             p, g = pred_object[t] - pred_origin[t], gt_object[t] - gt_origin[t]
             finite = np.isfinite(p).all() and np.isfinite(g).all()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import ObjectDetail, split_object
 from bigs.models.scene import Scene
 from bigs.motion.tracker import TrackedMotion
+from bigs.threads import beside
 from bigs.train.digest import run_digest
 from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
@@ -116,7 +116,7 @@ def fit(
     watch = watch or Stopwatch("start values")
     watch.begin("start values")
     # Few of the tracker's operations are parallel, so there is a core to spare beside it.
-    occluders = ThreadPoolExecutor(1).submit(unknown_occluders, clip)
+    occluders = beside().submit(unknown_occluders, clip)
     motion = None
     if config.stages and isinstance(config.stages[0], ObjectMotionStage):
         watch.begin(config.stages[0].name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from bigs.commands.render.frame import orbit_camera, render_frame, render_input_
 from bigs.data.base import Clip
 from bigs.metrics.picture import ALL_METRICS
 from bigs.models.playback import Playback
+from bigs.threads import beside
 from bigs.train.fit import FitReport
 from bigs.viewer.coverage import coverage_map
 from bigs.viewer.preview import contact_sheet, overlay, save_picture, to_bytes, write_video
@@ -124,7 +124,7 @@ def _strips(clip: Clip, playback: Playback, kept: list[tuple[str, Image.Image]])
 
 def _ahead(items: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
     """The same items, each made while the one before is used."""
-    with ThreadPoolExecutor(1) as pool:
+    with beside() as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
             coming = pool.submit(next, items, None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from bigs.metrics.headlines import headline_meanings, headline_table
 from bigs.metrics.picture import ALL_METRICS
 from bigs.metrics.report import check_comparable, comparison_table, evaluate, per_frame, remarks
 from bigs.models.playback import record
+from bigs.threads import beside
 from bigs.train.check_plan import check_plan
 from bigs.train.fit import FitReport, Observer, fit
 from bigs.train.loop.checkpoint import FILE_NAME
@@ -111,9 +111,9 @@ def reconstruct(
         check_comparable(baseline, truth)
 
     out.mkdir(parents=True, exist_ok=True)
-    with only_writer(out), ThreadPoolExecutor(2) as beside:
+    with only_writer(out), beside(2) as pool:
         # The start values leave a core to spare for it.
-        initial = None if truth is None else beside.submit(evaluate, baseline, truth)
+        initial = None if truth is None else pool.submit(evaluate, baseline, truth)
         remove_parts(out)
         # A checkpoint of another configuration is refused; without one, compare the options.
         if not begun:
@@ -152,9 +152,9 @@ def reconstruct(
             watch.begin("scores")
             listen({"event": "note", "stage": "outputs", "text": "scoring, drawing pictures"})
             # None needs another, nor much of the interpreter.
-            drawing = beside.submit(draw_pictures, out, clip, playback)
+            drawing = pool.submit(draw_pictures, out, clip, playback)
             found = playback.trajectory()
-            judging = None if truth is None else beside.submit(_judge, found, truth)
+            judging = None if truth is None else pool.submit(_judge, found, truth)
             frames = frame_scores(clip, playback)
             of_frames, against_truth = ({}, {}) if judging is None else judging.result()
             scores = {} if initial is None else {"initial": initial.result()}

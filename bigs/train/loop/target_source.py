@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.threads import beside
 from bigs.train.loop.targets import Targets, crop_box, load_targets
 
 # Stages return to an earlier resolution; of the others this many bytes are kept, since memory is scarce.
@@ -32,7 +33,7 @@ class TargetSource:
         """`unknown` [T, H, W] (bool) marks unlabelled occluders at the clip's size."""
         self.clip = clip
         self.unknown = unknown
-        self._thread = ThreadPoolExecutor(1, "targets")
+        self._thread = beside()
         # Every mask is read for it.
         self._box = self._thread.submit(crop_box, clip)
         self._made: dict[int, Targets] = {}
