@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -241,6 +242,8 @@ def test_pictures(finished_run: Run, tiny: Clip) -> None:
 def test_the_report_stands_alone(finished_run: Run, tiny: Clip) -> None:
     text = (finished_run.folder / "report.html").read_text()
     assert tiny.name in text and "MPJPE" in text and "data:image/" in text
+    assert re.search(r"left out.*fields that a stage does not train.*\(\d+\.\d s\)", text, re.DOTALL)
+    assert re.search(r"\d+% of every picture, where hands and object never are", text)
     for word in ('src="http', 'href="http', "<script src", '<link rel="stylesheet"', "@import"):
         assert word not in text
 

@@ -60,6 +60,8 @@ class FitReport:
     skipped: list[str] = field(default_factory=list)  # what was not done, and why
     retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
     facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
+    # Seconds that were not spent on what the clip or a stage does not need, by what that is.
+    spared: dict[str, float] = field(default_factory=dict)
     completed: bool = False  # whether symmetry has completed the object
     # Seconds of the interrupted runs that this one continues; `seconds` includes them.
     before: float = 0.0
@@ -71,6 +73,10 @@ class Waypoint(NamedTuple):
     stage: str  # of the plan, or "start values"
     step: int | None  # steps of the stage done; None at its end
 
+
+# What is spared, in the words of the report.
+_FROZEN = "fields that a stage does not train, in all of its steps but one"
+_SETTLED = "steps of stages whose loss had settled"
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
 Listener = Callable[[dict[str, Any]], None]
@@ -219,6 +225,7 @@ def fit(
             if last.step < stage.steps:
                 left = stage.steps - last.step
                 saved = watch.read()[stage.name] / last.step * left
+                report.spared[_SETTLED] = report.spared.get(_SETTLED, 0.0) + saved
                 report.skipped.append(
                     f"{stage.name}: {left} of {stage.steps} steps, the loss had settled ({saved:.1f} s saved)"
                 )
@@ -229,6 +236,12 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
+    left_out = [f"{what} ({seconds:.1f} s)" for what, seconds in report.spared.items() if seconds >= 0.05]
+    share = targets.cropped()
+    if share < 1.0:
+        left_out.append(f"{1.0 - share:.0%} of every picture, where hands and object never are")
+    if left_out:
+        report.facts["left out"] = ", ".join(left_out)
     report.facts |= finish_mesh(scene, start, sources, config, report.completed)
     report.seconds = watch.read()
     return scene, report
@@ -304,7 +317,9 @@ def _optimise(
     listen: Listener,
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
-        listen({"event": "step", "stage": stage.name, **progress._asdict(), "index": index})
+        told = progress._asdict()
+        report.spared[_FROZEN] = report.spared.get(_FROZEN, 0.0) + told.pop("spared")
+        listen({"event": "step", "stage": stage.name, **told, "index": index})
         if progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             keep(index, state)
 

@@ -57,6 +57,11 @@ class TargetSource:
         self._made[size] = found
         return found
 
+    def cropped(self) -> float:
+        """The share of a frame that is looked at: the box in which hands and object ever are."""
+        x0, y0, x1, y1 = self._box.result()
+        return (x1 - x0) * (y1 - y0) / (self.clip.width * self.clip.height)
+
     def make_ahead(self, sizes: Iterable[int]) -> None:
         """Begin to make the first of the sizes that `at` will be asked for and that is not there yet."""
         missing = [size for size in map(self._shrunk_to, sizes) if size not in self._made]

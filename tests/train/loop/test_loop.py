@@ -243,8 +243,14 @@ def test_frozen_fields_are_evaluated_once(
 ) -> None:
     """Two hands and several frames share one evaluation of a field that moves."""
     calls = count_calls(scene)
-    run_stage(scene, replace(TOGETHER, steps=5, lrs=lrs, weights=weights), evidence, 0)
+    told: list[StageProgress] = []
+    stage = replace(TOGETHER, steps=5, lrs=lrs, weights=weights)
+    run_stage(scene, stage, evidence, 0, after_step=lambda progress, state: told.append(progress))
     assert calls == expected
+    # The first step pays for all.
+    spared = [progress.spared for progress in told]
+    assert spared[0] == 0.0 and len(set(spared[1:])) == 1
+    assert (spared[1] > 0.0) == (1 in expected.values())
 
 
 # --- what a hook sees ---

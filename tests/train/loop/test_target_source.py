@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.train.loop.target_source import TargetSource
+from bigs.train.loop.targets import crop_box
 
 
 def source_of(clip: Clip) -> TargetSource:
@@ -29,6 +32,12 @@ def test_targets_are_kept_while_there_is_room(tiny: Clip, monkeypatch: pytest.Mo
     assert source.at(40) is not first
 
 
+def test_the_share_of_a_frame_that_is_looked_at(tiny: Clip) -> None:
+    x0, y0, x1, y1 = crop_box(tiny)
+    assert source_of(tiny).cropped() == (x1 - x0) * (y1 - y0) / (tiny.width * tiny.height)
+    assert 0.1 < source_of(tiny).cropped() < 1.0
+
+
 def test_nothing_is_enlarged_or_made_twice(tiny: Clip) -> None:
     source = source_of(tiny)
     whole = source.at(0)
@@ -36,7 +45,12 @@ def test_nothing_is_enlarged_or_made_twice(tiny: Clip) -> None:
     assert source.at(10 * tiny.width) is whole
 
 
-def test_the_next_are_made_in_another_thread(tiny: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_next_are_made_ahead(
+    tiny: Clip, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest, threads: int
+) -> None:
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(threads)
     source, plain = source_of(tiny), source_of(tiny)
     source.at(40)
     # What is there already is passed over; it takes one thread, whatever torch has.
