@@ -236,7 +236,7 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
-    left_out = [f"{what} ({seconds:.1f} s)" for what, seconds in report.spared.items() if seconds >= 0.05]
+    left_out = [f"{what} ({seconds:.2g} s)" for what, seconds in report.spared.items() if seconds > 0.0]
     share = targets.cropped()
     if share < 1.0:
         left_out.append(f"{1.0 - share:.0%} of every picture, where hands and object never are")

@@ -139,9 +139,17 @@ def test_a_finished_fit_is_not_run_again(
 def test_the_stopping_rule_survives_an_interruption(
     tiny: Clip, both_hands: dict[Side, HandModel], tmp_path: Path
 ) -> None:
-    """Rates of nothing: the loss has settled after twice the patience, resumed or not."""
+    """Rates of nothing: the loss has settled after twice the patience, resumed or not.
+
+    The report tells what the steps that were not taken would have cost, and fields that nothing trained.
+    """
     still = replace(
-        short_plan().stages[0], steps=30, lrs={"hand.ray": 1e-9}, weights={"silhouette": 1.0}, stop_patience=5
+        short_plan().stages[0],
+        steps=30,
+        lrs={"hand.ray": 1e-9},
+        weights={"image": 1.0},
+        frames_per_step=0,
+        stop_patience=5,
     )
     config = replace(short_plan(), stages=(still,))
     steps: list[int] = []
@@ -154,8 +162,13 @@ def test_the_stopping_rule_survives_an_interruption(
 
     with pytest.raises(Interrupted):
         fit(tiny, both_hands, config, checkpoints=tmp_path, listen=listen)
-    fit(tiny, both_hands, config, checkpoints=tmp_path, resume=True, listen=listen)
+    _, report = fit(tiny, both_hands, config, checkpoints=tmp_path, resume=True, listen=listen)
     assert steps == [1, 2, 3, 4, 5, 4, 5, 6, 7, 8, 9, 10]
+    of_fields, of_steps = report.spared.values()
+    assert 0.0 < of_fields < report.seconds[still.name]
+    assert of_steps == pytest.approx(20 / 10 * report.seconds[still.name], rel=0.2)
+    assert f"steps of stages whose loss had settled ({of_steps:.2g} s)" in report.facts["left out"]
+    assert f"in all of its steps but one ({of_fields:.2g} s)" in report.facts["left out"]
 
 
 def test_without_a_checkpoint_resuming_starts_anew(
