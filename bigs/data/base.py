@@ -95,11 +95,14 @@ class Clip:
 
     def image(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB, in the clip's usual exposure."""
+        image = self.image_as_taken(t)
+        return image if self.gains is None else _divided(image, self.gains[t])
+
+    def image_as_taken(self, t: int) -> np.ndarray:
+        """Frame `t`, [H, W, 3] uint8 RGB, in its own exposure."""
         if self.optics is None:
-            found = read_image(self.image_paths[t], (self.width, self.height))
-        else:
-            found = self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
-        return found if self.gains is None else _divided(found, self.gains[t])
+            return read_image(self.image_paths[t], (self.width, self.height))
+        return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
 
     def mask(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""

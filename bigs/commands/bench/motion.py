@@ -114,7 +114,7 @@ def _measure(
     for t in range(len(masks)) if pixels else ():
         change = (scipy.ndimage.binary_erosion, scipy.ndimage.binary_dilation)[t % 2]
         masks[t] = change(masks[t], iterations=pixels)
-    images = [clip.image(t) for t in range(len(clip))]
+    images = [clip.image_as_taken(t) for t in range(len(clip))]
     poses = GivenPoses(given, start.centers.double().numpy(), start.trust.double().numpy())
     wall, cpu = time.perf_counter(), time.process_time()
     found = track(images, masks, np.asarray(clip.K, dtype=np.float64), poses, TrackerConfig())

@@ -64,8 +64,7 @@ def convert(
     if plan.every < 1 or plan.width < 0:
         raise InputError(f"--every, --width: expected at least 1 and 0, found {plan.every} and {plan.width}")
     hand_models = load_hand_models(hand_model)
-    # Pictures go on as they were taken; whatever opens the new clip brings them to one exposure.
-    clip = replace(open_clip(source, hand_models), gains=None)
+    clip = open_clip(source, hand_models)
     if clip.annotated and not plan.from_truth:
         raise InputError(
             f"{source}: expected a clip with initial estimates, found a data set's ground truth "
@@ -190,7 +189,8 @@ def _resized(width: int, height: int, K: np.ndarray, wanted: int) -> tuple[tuple
 
 def _pictures(clip: Clip, size: tuple[int, int]) -> Iterator[np.ndarray]:
     for t in range(len(clip)):
-        image = clip.image(t)
+        # Whatever opens the new clip brings it to one exposure again.
+        image = clip.image_as_taken(t)
         yield image if size == (clip.width, clip.height) else _scaled(image, size, Image.Resampling.BOX)
 
 

@@ -52,7 +52,9 @@ def find_object_motion(
     kept = None if folder is None else _read(folder / FILE_NAME, digest)
     if kept is not None:
         return kept
-    images = side_by_side(clip.image, range(len(clip)))
+    # Patches are compared whatever their brightness. In one exposure, white that bright frames cut off would
+    # darken and lighten.
+    images = side_by_side(clip.image_as_taken, range(len(clip)))
     masks = np.stack(side_by_side(clip.mask, range(len(clip)))) == MASK_VALUES["object"]
     found = track(images, masks, np.asarray(clip.K, dtype=np.float64), given, stage.tracker)
     if folder is not None:

@@ -88,6 +88,23 @@ def test_what_was_found_is_kept_for_the_same_clip_and_plan(
     assert len(calls) == 3
 
 
+def test_tracks_are_sought_in_the_pictures_as_they_were_taken(
+    tiny: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[np.ndarray] = []
+
+    def track(
+        images: list[np.ndarray], masks: object, K: object, given: GivenPoses, config: object
+    ) -> TrackedMotion:
+        seen.extend(images)
+        return tracked(given)
+
+    monkeypatch.setattr(object_motion, "track", track)
+    find_object_motion(replace(tiny, gains=np.full((len(tiny), 3), 2.0)), SMOKE.initial, STAGE, None)
+    for t, image in enumerate(seen):
+        np.testing.assert_array_equal(image, tiny.image(t))
+
+
 def test_a_clip_without_an_object_has_no_motion(tiny: Clip, calls: list[GivenPoses]) -> None:
     assert find_object_motion(replace(tiny, object=None), SMOKE.initial, STAGE, None) is None
     hidden = replace(tiny, mask_areas=tiny.mask_areas | {"object": np.zeros(len(tiny), dtype=int)})
