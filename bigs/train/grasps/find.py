@@ -132,7 +132,7 @@ def _search(
         usual = float(mismatch(side, poses, torch.arange(scene.n_frames)).nanquantile(0.25))
         apart = prices.free * ~touches
         for _ in range(stage.rounds):
-            hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, stage.least))
+            hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, prices))
             pictures = np.stack(
                 [_excess(mismatch, side, poses, carrier, h, usual) for h in hypotheses]
                 or [np.zeros((0, scene.n_frames))]
@@ -153,8 +153,9 @@ def _search(
     return FoundGrasps([s.frames for s in stretches], torch.as_tensor(sure, dtype=torch.float32))
 
 
-def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
+def _hypotheses(stretches: list[range], count: int, prices: Prices) -> list[range]:
     """The frames that give hypotheses: each grasp, two neighbours as one, and frames outside grasps."""
+    least, few = prices.least, min(prices.least_at_border, count)
     found = list(stretches)
     found += [range(a.start, b.stop) for a, b in pairwise(stretches)]
     edges = [0, *(edge for s in stretches for edge in (s.start, s.stop)), count]
@@ -162,7 +163,8 @@ def _hypotheses(stretches: list[range], count: int, least: int) -> list[range]:
         # Windows that overlap by half, so that most of a grasp lies in one of them.
         step = 2 * least
         found += [range(a, min(a + step, stop)) for a in range(start, stop - least + 1, least)]
-    return found
+    # What the clip's border cuts off may be short.
+    return [*found, range(few), range(count - few, count)]
 
 
 def _estimate_costs(points: np.ndarray, information: np.ndarray, stretches: list[range]) -> np.ndarray:

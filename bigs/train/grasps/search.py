@@ -33,9 +33,14 @@ class Prices(NamedTuple):
     """The prices of a segmentation; frames of grasps pay by their misfit."""
 
     free: float  # price of a frame outside grasps
-    grasp: float  # price of each grasp
+    grasp: float  # price of each grasp, half of it for each of its ends: the clip's border is none
     least: int  # fewest frames of a grasp
     gap: int  # fewest frames between two grasps: nobody lets go and grasps again in less
+
+    @property
+    def least_at_border(self) -> int:
+        """Fewest frames of a grasp that goes on beyond the clip: more than half of one."""
+        return self.least // 2 + 1
 
 
 def still_costs(points: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -134,14 +139,17 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     which = costs.argmin(axis=0)
     cost = np.take_along_axis(costs, which[None], axis=0)[0]
     starts, ends = np.arange(count)[:, None], np.arange(count + 1)[None]
-    cost = np.where(ends - starts >= prices.least, cost, np.inf)
+    own_ends = (starts > 0).astype(int) + (ends < count)
+    cost = cost + 0.5 * prices.grasp * own_ends
+    least = np.where(own_ends == 2, prices.least, prices.least_at_border)
+    cost = np.where(ends - starts >= least, cost, np.inf)
     # The cheapest cut of the first t frames that may begin a grasp next, and the cheapest that ends in one.
     open_, ended = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     open_[0] = 0.0
     began = np.zeros(count + 1, dtype=int)
     after_grasp = np.zeros(count + 1, dtype=bool)
     for t in range(1, count + 1):
-        candidates = open_[:t] + prices.grasp + cost[:t, t]
+        candidates = open_[:t] + cost[:t, t]
         began[t] = candidates.argmin()
         ended[t] = candidates[began[t]]
         open_[t] = open_[t - 1] + prices.free

@@ -71,10 +71,11 @@ class GraspStage:
     name: str = "grasps"
     step: StepKind = "interacting-subjects"
     # A frame outside grasps costs as much as a frame in a grasp with this squared error, in standard
-    # deviations; a grasp costs as much as a few frames outside, so that five frames can form one.
+    # deviations; a grasp costs as much as a few frames outside, so that five frames can form one. Each of its
+    # ends costs half of that: the clip's border is none, and what it cuts off may be three frames long.
     free: float = 3.0
     grasp: float = 8.0
-    # Fewest frames of a grasp.
+    # Fewest frames of a grasp between two moves.
     least: int = 4
     # Fewest frames between two grasps: nobody lets go and grasps again within a sixth of a second.
     gap: int = 5

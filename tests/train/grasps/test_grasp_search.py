@@ -55,6 +55,11 @@ def test_costs_of_stretches_are_those_of_least_squares() -> None:
     assert np.isinf(costs[3, :4]).all()
 
 
+def own_ends(start: int, stop: int, count: int) -> int:
+    """How many ends of a grasp lie within the clip."""
+    return (start > 0) + (stop < count)
+
+
 def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
     """The least price of any cut, by trying every one."""
     count = costs.shape[1]
@@ -63,13 +68,15 @@ def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
     for grasps in range(1, 4):
         for cut in combinations(edges, 2 * grasps):
             pairs = list(zip(cut[::2], cut[1::2], strict=True))
-            short = any(b - a < prices.least for a, b in pairs)
+            ends = [own_ends(a, b, count) for a, b in pairs]
+            least = [prices.least if n == 2 else prices.least_at_border for n in ends]
+            short = any(b - a < fewest for (a, b), fewest in zip(pairs, least, strict=True))
             near = any(after[0] - before[1] < prices.gap for before, after in pairwise(pairs))
             if short or near:
                 continue
             inside = sum(min(c[a:b].sum() for c in costs) for a, b in pairs)
             held = sum(b - a for a, b in pairs)
-            best = min(best, inside + prices.free * (count - held) + prices.grasp * grasps)
+            best = min(best, inside + prices.free * (count - held) + prices.grasp * sum(ends) / 2)
     return best
 
 
@@ -77,11 +84,12 @@ def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
 def test_no_cut_is_cheaper(seed: int) -> None:
     rng = np.random.default_rng(seed)
     costs = rng.gamma(0.7, 1.5, (2, 13))
-    prices = Prices(free=1.0, grasp=0.4, least=2, gap=2)
+    prices = Prices(free=1.0, grasp=0.4, least=4, gap=2)
     found = grasps_by_frames(costs, prices)
     limited = np.minimum(costs, 2.5)
     held = sum(len(frames) for frames, _ in found)
-    paid = sum(limited[h, frames].sum() for frames, h in found) + prices.grasp * len(found) + 13 - held
+    ends = sum(own_ends(frames.start, frames.stop, 13) for frames, _ in found)
+    paid = sum(limited[h, frames].sum() for frames, h in found) + prices.grasp * ends / 2 + 13 - held
     assert paid == pytest.approx(cheapest_of_all(limited, prices))
     assert all(b.frames.start - a.frames.stop >= 2 for a, b in pairwise(found))
 
@@ -92,6 +100,19 @@ def test_grasps_are_found_where_the_hand_stands_still() -> None:
     assert len(found) == 3, "five frames are enough"
     for frames, (start, stop) in zip(found, ((0, 12), (20, 25), (33, 48)), strict=True):
         assert abs(frames.start - start) <= 2 and abs(frames.stop - stop) <= 2
+
+
+@pytest.mark.parametrize(("count", "held"), [(1, False), (2, False), (3, True)])
+def test_the_border_may_cut_a_grasp_short(count: int, held: bool) -> None:
+    """It goes on beyond the clip, so three frames are enough there, and not between two moves."""
+    move = np.linspace(0.0, 0.8, 10)[1:-1]
+    x = np.concatenate([np.zeros(count), move, np.full(3, 0.8), 0.8 + move, np.full(15, 1.6)])
+    points, information = seen(x, noise=0.001)
+    for order in (slice(None), slice(None, None, -1)):
+        found = grasps_by_estimates(points[order], information[order], np.ones(len(points), bool), PRICES)
+        if order.step:
+            found = [range(len(points) - s.stop, len(points) - s.start) for s in found[::-1]]
+        assert found == [range(0, 3)] * held + [range(len(x) - 15, len(x))]
 
 
 def test_estimates_that_waver_along_the_view_are_one_grasp() -> None:
