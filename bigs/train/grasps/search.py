@@ -136,13 +136,19 @@ def grasps_by_frames(costs: np.ndarray, prices: Prices) -> list[Stretch]:
 def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     """The cheapest cut, given what every stretch costs under every hypothesis: [H, T, T + 1]."""
     count = costs.shape[1]
+    # A frame at the border that hardly agrees is no reason to believe that the grasp goes on beyond it.
+    sure = 0.5 * prices.free
+    came, goes = costs[:, 0, 1] <= sure, costs[:, -1, -1] <= sure
+    costs = costs + prices.grasp
+    costs[came, 0] -= 0.5 * prices.grasp
+    costs[goes, :, -1] -= 0.5 * prices.grasp
+    lengths = np.arange(count + 1)[None] - np.arange(count)[:, None]
+    allowed = np.tile(lengths >= prices.least, (len(costs), 1, 1))
+    allowed[came, 0] = lengths[0] >= prices.least_at_border
+    allowed[goes, :, -1] = lengths[:, -1] >= prices.least_at_border
+    costs[~allowed] = np.inf
     which = costs.argmin(axis=0)
     cost = np.take_along_axis(costs, which[None], axis=0)[0]
-    starts, ends = np.arange(count)[:, None], np.arange(count + 1)[None]
-    own_ends = (starts > 0).astype(int) + (ends < count)
-    cost = cost + 0.5 * prices.grasp * own_ends
-    least = np.where(own_ends == 2, prices.least, prices.least_at_border)
-    cost = np.where(ends - starts >= least, cost, np.inf)
     # The cheapest cut of the first t frames that may begin a grasp next, and the cheapest that ends in one.
     open_, ended = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     open_[0] = 0.0

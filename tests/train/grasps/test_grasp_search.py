@@ -55,9 +55,22 @@ def test_costs_of_stretches_are_those_of_least_squares() -> None:
     assert np.isinf(costs[3, :4]).all()
 
 
-def own_ends(start: int, stop: int, count: int) -> int:
-    """How many ends of a grasp lie within the clip."""
-    return (start > 0) + (stop < count)
+def own_ends(row: np.ndarray, start: int, stop: int, free: float) -> int:
+    """How many ends a grasp has within the clip, by what its frames cost [T]; the border is none where it is
+    sure."""
+    return sum(
+        bool(own) for own in (start > 0 or row[0] > 0.5 * free, stop < len(row) or row[-1] > 0.5 * free)
+    )
+
+
+def price_of(row: np.ndarray, start: int, stop: int, prices: Prices) -> float:
+    """Of a grasp, infinite where it is too short."""
+    ends = own_ends(row, start, stop, prices.free)
+    reaches = (start == 0 and row[0] <= 0.5 * prices.free) or (
+        stop == len(row) and row[-1] <= 0.5 * prices.free
+    )
+    least = prices.least_at_border if reaches else prices.least
+    return row[start:stop].sum() + 0.5 * prices.grasp * ends if stop - start >= least else np.inf
 
 
 def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
@@ -68,15 +81,12 @@ def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
     for grasps in range(1, 4):
         for cut in combinations(edges, 2 * grasps):
             pairs = list(zip(cut[::2], cut[1::2], strict=True))
-            ends = [own_ends(a, b, count) for a, b in pairs]
-            least = [prices.least if n == 2 else prices.least_at_border for n in ends]
-            short = any(b - a < fewest for (a, b), fewest in zip(pairs, least, strict=True))
             near = any(after[0] - before[1] < prices.gap for before, after in pairwise(pairs))
-            if short or near:
+            if near:
                 continue
-            inside = sum(min(c[a:b].sum() for c in costs) for a, b in pairs)
+            inside = sum(min(price_of(row, a, b, prices) for row in costs) for a, b in pairs)
             held = sum(b - a for a, b in pairs)
-            best = min(best, inside + prices.free * (count - held) + prices.grasp * sum(ends) / 2)
+            best = min(best, inside + prices.free * (count - held))
     return best
 
 
@@ -88,8 +98,7 @@ def test_no_cut_is_cheaper(seed: int) -> None:
     found = grasps_by_frames(costs, prices)
     limited = np.minimum(costs, 2.5)
     held = sum(len(frames) for frames, _ in found)
-    ends = sum(own_ends(frames.start, frames.stop, 13) for frames, _ in found)
-    paid = sum(limited[h, frames].sum() for frames, h in found) + prices.grasp * ends / 2 + 13 - held
+    paid = sum(price_of(limited[h], s.start, s.stop, prices) for s, h in found) + 13 - held
     assert paid == pytest.approx(cheapest_of_all(limited, prices))
     assert all(b.frames.start - a.frames.stop >= 2 for a, b in pairwise(found))
 
@@ -147,6 +156,18 @@ def test_hypotheses_compete_for_frames() -> None:
     found = grasps_by_frames(costs, Prices(1.0, 2.0, 4, 5))
     assert found == [(range(0, 18), 0), (range(26, 40), 2)], "two faulty frames are bridged"
     assert grasps_by_frames(np.zeros((0, 40)), PRICES) == []
+
+
+@pytest.mark.parametrize(("last", "held"), [(0.3, True), (0.9, False)])
+def test_a_doubtful_frame_at_the_border_is_no_grasp_that_goes_on(last: float, held: bool) -> None:
+    costs = np.full((1, 30), 3.0)
+    costs[0, 10:29], costs[0, 29] = 0.1, last
+    prices = Prices(free=1.0, grasp=1.0, least=4, gap=5)
+    (found,) = grasps_by_frames(costs, prices)
+    # The frame costs less inside than outside, so the grasp has it; but then it pays for its end.
+    assert found == (range(10, 30), 0)
+    costs[0, 10:27], costs[0, 27:29] = 3.0, 0.1
+    assert grasps_by_frames(costs, prices) == [(range(27, 30), 0)] * held
 
 
 def test_certainty_is_even_where_a_frame_could_as_well_be_free() -> None:
