@@ -136,17 +136,7 @@ def grasps_by_frames(costs: np.ndarray, prices: Prices) -> list[Stretch]:
 def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     """The cheapest cut, given what every stretch costs under every hypothesis: [H, T, T + 1]."""
     count = costs.shape[1]
-    # A frame at the border that hardly agrees is no reason to believe that the grasp goes on beyond it.
-    sure = 0.5 * prices.free
-    came, goes = costs[:, 0, 1] <= sure, costs[:, -1, -1] <= sure
-    costs = costs + prices.grasp
-    costs[came, 0] -= 0.5 * prices.grasp
-    costs[goes, :, -1] -= 0.5 * prices.grasp
-    lengths = np.arange(count + 1)[None] - np.arange(count)[:, None]
-    allowed = np.tile(lengths >= prices.least, (len(costs), 1, 1))
-    allowed[came, 0] = lengths[0] >= prices.least_at_border
-    allowed[goes, :, -1] = lengths[:, -1] >= prices.least_at_border
-    costs[~allowed] = np.inf
+    costs = _priced(costs, prices)
     which = costs.argmin(axis=0)
     cost = np.take_along_axis(costs, which[None], axis=0)[0]
     # The cheapest cut of the first t frames that may begin a grasp next, and the cheapest that ends in one.
@@ -175,6 +165,26 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
         else:
             t -= 1
     return found[::-1]
+
+
+def _priced(costs: np.ndarray, prices: Prices) -> np.ndarray:
+    """What every stretch costs as a grasp, with its ends; infinite where it is too short: [H, T, T + 1].
+
+    The clip's border is no end where the frame there agrees. One that hardly does is no reason to believe that
+    the grasp goes on.
+    """
+    count = costs.shape[1]
+    sure = 0.5 * prices.free
+    came, goes = costs[:, 0, 1] <= sure, costs[:, -1, -1] <= sure
+    costs = costs + prices.grasp
+    costs[came, 0] -= 0.5 * prices.grasp
+    costs[goes, :, -1] -= 0.5 * prices.grasp
+    lengths = np.arange(count + 1)[None] - np.arange(count)[:, None]
+    allowed = np.tile(lengths >= prices.least, (len(costs), 1, 1))
+    allowed[came, 0] = lengths[0] >= prices.least_at_border
+    allowed[goes, :, -1] = lengths[:, -1] >= prices.least_at_border
+    costs[~allowed] = np.inf
+    return costs
 
 
 def certainties(costs: np.ndarray, free: float) -> np.ndarray:
