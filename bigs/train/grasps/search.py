@@ -170,8 +170,8 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
 def _priced(costs: np.ndarray, prices: Prices) -> np.ndarray:
     """What every stretch costs as a grasp, with its ends; infinite where it is too short: [H, T, T + 1].
 
-    The clip's border is no end where the frame there agrees. One that hardly does is no reason to believe that
-    the grasp goes on.
+    The clip's border is no end where the frame there agrees. One that hardly does is no reason to believe
+    that the grasp goes on.
     """
     count = costs.shape[1]
     sure = 0.5 * prices.free
