@@ -111,7 +111,7 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def use_threads(threads: int) -> None:
-    """Limit the threads of torch, the engine and COLMAP; 0 does not."""
+    """Limit the threads of torch, the engine, COLMAP and `bigs.threads`; 0 does not."""
     if not 0 <= threads <= _MOST_THREADS:
         raise InputError(f"--threads: expected 0 to {_MOST_THREADS}, found {shown(threads)}")
     if threads:
