@@ -75,12 +75,8 @@ def tiny(tiny_clip: Path) -> Clip:
 
 @pytest.fixture(scope="session")
 def finished_run(made_once: MadeOnce, tiny_clip: Path) -> Run:
-    """`bigs reconstruct` of the tiny clip with the smoke preset. Read it, never write into it.
-
-    On two threads, as users run it: much of it is then done beside the steps.
-    """
+    """`bigs reconstruct` of the tiny clip with the smoke preset. Read it, never write into it."""
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
-    command += ["--threads", "2"]
     folder, answer = made_once("finished", lambda folder: run_bigs(*command, "--out", folder / "run"))
     return Run(folder / "run", command, Answer(*answer))
 
