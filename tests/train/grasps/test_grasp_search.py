@@ -7,6 +7,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
+from bigs.train.grasps.find import _hypotheses
 from bigs.train.grasps.search import (
     Prices,
     certainties,
@@ -168,6 +169,13 @@ def test_a_doubtful_frame_at_the_border_is_no_grasp_that_goes_on(last: float, he
     assert found == (range(10, 30), 0)
     costs[0, 10:27], costs[0, 27:29] = 3.0, 0.1
     assert grasps_by_frames(costs, prices) == [(range(27, 30), 0)] * held
+
+
+def test_what_the_border_cuts_off_is_a_hypothesis_of_its_own() -> None:
+    for stretches in ([], [range(5, 20)]):
+        found = _hypotheses(stretches, 30, PRICES)
+        assert range(0, 3) in found and range(27, 30) in found
+    assert all(0 <= h.start < h.stop <= 2 for h in _hypotheses([], 2, PRICES))
 
 
 def test_certainty_is_even_where_a_frame_could_as_well_be_free() -> None:

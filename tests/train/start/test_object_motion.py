@@ -101,6 +101,7 @@ def test_tracks_are_sought_in_the_pictures_as_they_were_taken(
 
     monkeypatch.setattr(object_motion, "track", track)
     find_object_motion(replace(tiny, gains=np.full((len(tiny), 3), 2.0)), SMOKE.initial, STAGE, None)
+    assert len(seen) == len(tiny)
     for t, image in enumerate(seen):
         np.testing.assert_array_equal(image, tiny.image(t))
 
