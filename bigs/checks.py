@@ -121,6 +121,12 @@ def check_faces(name: str, faces: Any, vertex_count: int) -> None:
         )
 
 
+def check_positive(name: str, value: float) -> None:
+    """Raise `InputError` unless `value` is a finite number above zero."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name}: expected a positive number, found {value:g}")
+
+
 def check_pixels(name: str, width: int, height: int, most: int = MAX_PIXELS) -> None:
     """Raise `InputError` unless a picture of `width` x `height` has at most `most` pixels."""
     if width * height > most:

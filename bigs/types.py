@@ -17,6 +17,9 @@ ENTITIES: tuple[Entity, ...] = ("right", "left", "object")
 # Values of the label masks of a clip, as HOLD's and the HANDS challenge's `build` folders have them.
 MASK_VALUES: dict[Entity, int] = {"object": 50, "right": 150, "left": 250}
 
+# Frames a second of clips and pictures that do not say. Plans are written for it.
+USUAL_FPS = 30.0
+
 
 class Gaussians(NamedTuple):
     """A set of 3D Gaussians (paper Eq. 1); leading batch axes are allowed."""

@@ -8,12 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from glb_reader import Glb
 from PIL import Image
 from safetensors.numpy import load_file
 from short_plans import short
 
+from bigs.commands.clips.convert import ConvertPlan, convert
+from bigs.commands.export.formats import write_format
+from bigs.commands.folder.contents import load_run
+from bigs.commands.render.live import make_stage
+from bigs.commands.render.views import Shot, Wanted, render_run
 from bigs.commands.run.reconstruct import reconstruct
 from bigs.train.plan.presets import PRESETS
+from bigs.train.plan.rate import at_rate
 from bigs.types import ENTITIES, MASK_VALUES
 from bigs.unpickle import load_npy
 
@@ -87,6 +94,32 @@ def test_a_clip_with_gaps(tiny_clip: Path, tmp_path: Path) -> None:
     reconstruct(clip, tmp_path / "run", short(PRESETS["smoke"]))
     written = load_file(tmp_path / "run" / "scene.safetensors")
     assert all(np.isfinite(values).all() for values in written.values())
+
+
+def test_a_clip_of_fewer_frames_a_second(tiny_clip: Path, tmp_path: Path) -> None:
+    """Its rate is that of the plan and of everything that plays."""
+    convert(tiny_clip, tmp_path / "clip", ConvertPlan(every=3))
+    plan = short(PRESETS["smoke"])
+    reconstruct(tmp_path / "clip", tmp_path / "run", plan)
+    playback = load_run(tmp_path / "run")
+    assert (len(playback), playback.fps, make_stage(playback, None, None).fps) == (4, 10.0, 10.0)
+    (glb,) = write_format(tmp_path, playback, "glb")
+    np.testing.assert_allclose(Glb(glb).times(), [0.0, 0.1, 0.2, 0.3], atol=1e-6)
+    # The same as with a plan made for it and a clip of the usual rate.
+    convert(tmp_path / "clip", tmp_path / "usual", ConvertPlan(fps=30.0))
+    reconstruct(tmp_path / "usual", tmp_path / "again", at_rate(plan, 10.0))
+    slow, usual = (load_file(tmp_path / run / "scene.safetensors") for run in ("run", "again"))
+    for name, values in slow.items():
+        np.testing.assert_array_equal(values, usual[name], err_msg=name)
+    reconstruct(tmp_path / "usual", tmp_path / "other", plan)
+    other = load_file(tmp_path / "other" / "scene.safetensors")
+    assert any(not np.array_equal(values, other[name]) for name, values in slow.items())
+    av = pytest.importorskip("av")
+    turn = tmp_path / "turn.mp4"
+    render_run(tmp_path / "run", Shot(orbit=True, pictures=2), Wanted(video=turn))
+    for video in (tmp_path / "run" / "preview.mp4", turn):
+        with av.open(str(video)) as container:
+            assert container.streams.video[0].average_rate == 10
 
 
 @pytest.mark.parametrize("frames", [1, 2])

@@ -13,6 +13,7 @@ def convert(
     out: Path,
     view: Literal["full", "limited"] = "full",
     every: int = 1,
+    fps: float | None = None,
     width: int = 0,
     masks: Path | None = None,
     from_truth: bool = False,
@@ -27,6 +28,7 @@ def convert(
         out: folder to make.
         view: full, or the paper's limited view: a quarter of the frames that shows the object from few sides.
         every: keep every Nth frame.
+        fps: frames a second of the clip; by default what its files say, and 30 if they do not.
         width: width of the images; 0 keeps theirs.
         masks: folder of label masks (0, 50 object, 150 right, 250 left) named like the images; the clip's own
             by default.
@@ -36,5 +38,5 @@ def convert(
     from bigs.commands.clips.convert import ConvertPlan
     from bigs.commands.clips.convert import convert as run
 
-    for name, text in run(clip, out, ConvertPlan(view, every, width, masks, from_truth), hand_model):
+    for name, text in run(clip, out, ConvertPlan(view, every, fps, width, masks, from_truth), hand_model):
         say(f"{name:10s} {text}")

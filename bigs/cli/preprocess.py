@@ -34,6 +34,8 @@ class FrameOptions:
     """Number of the first picture to use."""
     count: int = 0
     """Stop after this many frames; 0 keeps all."""
+    fps: float | None = None
+    """Frames a second of the source; by default what a video says, and 30 for a folder of images."""
     max_size: int = 1280
     """Shrink larger pictures to this many pixels on the longer side; 0 keeps their size."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from bigs.data.images import read_image, read_mask
 from bigs.data.optics import Optics
 from bigs.names import check_name
-from bigs.types import MASK_VALUES, Entity, Side
+from bigs.types import MASK_VALUES, USUAL_FPS, Entity, Side
 
 # Every label with the hands' exchanged.
 _EXCHANGED = np.arange(256, dtype=np.uint8)
@@ -81,6 +81,7 @@ class Clip:
         np.ndarray
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files, for every entity
+    fps: float = USUAL_FPS  # frames a second
     annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bigs.checks import InputError, check_finite, check_shape, shown
+from bigs.checks import InputError, check_finite, check_positive, check_shape, shown
 
 # In metres, pixels, radians and counts no plausible number is larger, and squares of larger ones overflow
 # float32.
@@ -52,6 +52,13 @@ def number_entry(where: str, value: Any) -> float:
         raise InputError(f"{where}: expected one number, found {shown(value)}")
     check_finite(where, array.reshape(()))
     return float(array.reshape(()))
+
+
+def positive_entry(where: str, value: Any) -> float:
+    """`number_entry` of a number above zero."""
+    number = number_entry(where, value)
+    check_positive(where, number)
+    return number
 
 
 def _numbers(where: str, value: Any) -> np.ndarray:

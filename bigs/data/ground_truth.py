@@ -16,7 +16,7 @@ import trimesh
 from bigs.archives import read_npz
 from bigs.checks import InputError, check_faces, check_pixels, check_product, check_rotations
 from bigs.data.base import HandTrack
-from bigs.data.entries import array_entry, number_entry, require
+from bigs.data.entries import array_entry, positive_entry, require
 from bigs.data.formats.annotation import Annotation, ObjectTruth
 from bigs.data.meshes import check_solid, read_mesh
 from bigs.files import read_text
@@ -149,9 +149,7 @@ def _object_poses(
     rotations = _field(file, arrays, "obj_R", (frames, 3, 3))
     check_rotations(f"{file}: obj_R", rotations)
     transl = _field(file, arrays, "obj_t", (len(rotations), 3))
-    scale = number_entry(f"{file}: obj_scale", arrays["obj_scale"]) if "obj_scale" in arrays else 1.0
-    if scale <= 0:
-        raise InputError(f"{file}: obj_scale: expected a positive number, found {scale:g}")
+    scale = positive_entry(f"{file}: obj_scale", arrays["obj_scale"]) if "obj_scale" in arrays else 1.0
     return rotations, transl, scale
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bigs.checks import InputError
-from bigs.data.entries import mapping_entry, number_entry, require
+from bigs.data.entries import mapping_entry, number_entry, positive_entry, require
 from bigs.data.formats.transforms import (
     PlacedCamera,
     RenderCamera,
@@ -60,7 +60,7 @@ def load_cameras(
     if "camera_path" in document:
         placed = _path_cameras(path, document, size)
         if "fps" in document:
-            fps = _positive(f"{path}: fps", document["fps"])
+            fps = positive_entry(f"{path}: fps", document["fps"])
     else:
         placed = cameras_in(path, document, size)
     times = _times(placed, frame_count, time_of)
@@ -124,10 +124,3 @@ def _rows(where: str, stored: Any) -> list[list[Any]]:
         found = f"{len(stored)}" if isinstance(stored, list) else type(stored).__name__
         raise InputError(f"{where}: expected a list of 16 numbers, found {found}")
     return [stored[at : at + 4] for at in range(0, 16, 4)]
-
-
-def _positive(where: str, value: Any) -> float:
-    number = number_entry(where, value)
-    if number <= 0:
-        raise InputError(f"{where}: expected a positive number, found {number:g}")
-    return number

@@ -10,7 +10,7 @@ import numpy as np
 
 from bigs.archives import read_npz
 from bigs.atomic import atomic_write
-from bigs.checks import InputError, check_finite, check_rotations, check_shape
+from bigs.checks import InputError, check_finite, check_positive, check_rotations, check_shape
 from bigs.types import SIDES, Side
 
 FORMAT = "bigs-poses-2"
@@ -121,7 +121,4 @@ def _check(where: str, arrays: dict[str, np.ndarray]) -> None:
         check_finite(f"{where}: {key}", arrays[key])
     if "object_rotations" in shapes:
         check_rotations(f"{where}: object_rotations", arrays["object_rotations"])
-        if arrays["object_scale"] <= 0:
-            raise InputError(
-                f"{where}: object_scale: expected a positive number, found {arrays['object_scale']:g}"
-            )
+        check_positive(f"{where}: object_scale", float(arrays["object_scale"]))

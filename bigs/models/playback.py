@@ -21,7 +21,7 @@ from bigs.models.poses import ObjectFrames
 from bigs.models.posing import Covered, Part, hand_part, object_part, pose_parts
 from bigs.models.scene import Scene
 from bigs.names import check_name
-from bigs.types import Entity, Gaussians, HandObjectTrajectory, Side
+from bigs.types import USUAL_FPS, Entity, Gaussians, HandObjectTrajectory, Side
 
 # Fields with a value per frame.
 _MOVING_HAND = (
@@ -110,6 +110,7 @@ class Playback:
     light: Tensor | None  # [8, 3] the clip's light (see `lighting`); None: colours are fixed
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
+    fps: float = USUAL_FPS  # frames a second
 
     def __post_init__(self) -> None:
         check_name("the scene's name", self.name)
@@ -205,7 +206,11 @@ class Playback:
 
 @torch.no_grad()
 def record(
-    scene: Scene, name: str, frame_names: tuple[str, ...], normalize_shift: Sequence[float] | np.ndarray
+    scene: Scene,
+    name: str,
+    frame_names: tuple[str, ...],
+    normalize_shift: Sequence[float] | np.ndarray,
+    fps: float = USUAL_FPS,
 ) -> Playback:
     """Evaluate a scene once and keep what is needed to show it.
 
@@ -214,6 +219,7 @@ def record(
         name: of the clip; names files.
         frame_names: T names.
         normalize_shift: [3] of the clip, see `Playback`.
+        fps: frames a second of the clip.
     """
     frames = torch.arange(scene.n_frames)
     canonical = scene.canonical(scene.entities)
@@ -286,4 +292,5 @@ def record(
         None if scene.lighting is None else scene.lighting.clip.detach().clone(),
         hands,
         obj,
+        fps,
     )

@@ -30,7 +30,7 @@ from bigs.files import check_regular, parse_json
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
 from bigs.names import check_name
-from bigs.types import SIDES, Side
+from bigs.types import SIDES, USUAL_FPS, Side
 
 FORMAT = "bigs-scene-5"
 # The format before, without occlusion, and the one before that, without a checksum and grasps as well.
@@ -60,6 +60,7 @@ def save_playback(path: Path, playback: Playback) -> None:
         "frame_names": playback.frame_names,
         "size": [playback.width, playback.height],
         "normalize_shift": playback.normalize_shift,
+        "fps": playback.fps,
     }
     facts = {"format": FORMAT, **facts}
     # A single key, since the writer's order of keys differs from run to run.
@@ -95,6 +96,8 @@ def load_playback(path: Path) -> Playback:
             f"{path}: expected the checksum {expected} of its content, found {shown(stored)}: the file was "
             "damaged (bigs reconstruct --resume into the same folder writes it again)"
         )
+    # What earlier versions did not store.
+    facts.setdefault("fps", USUAL_FPS)
     if facts["format"] == _UNSUMMED:
         tensors |= _without_grasps(tensors)
     if facts["format"] != FORMAT:
@@ -180,6 +183,8 @@ def _check_facts(where: str, facts: Mapping[str, Any]) -> None:
     check_pixels(f"{where}: size", *size)
     if not isinstance(shift, list) or len(shift) != 3 or not all(_is_finite(part) for part in shift):
         raise InputError(f"{where}: normalize_shift: expected three numbers, found {shown(shift)}")
+    if not _is_finite(facts["fps"]) or facts["fps"] <= 0.0:
+        raise InputError(f"{where}: fps: expected a positive number, found {shown(facts['fps'])}")
 
 
 def _is_pixels(value: Any) -> bool:
@@ -287,4 +292,5 @@ def _assemble(metadata: dict[str, Any], tensors: dict[str, Tensor]) -> Playback:
         tensors.get("light"),
         hands,
         obj,
+        metadata["fps"],
     )

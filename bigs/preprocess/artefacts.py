@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bigs.checks import InputError, shown
+from bigs.checks import InputError, check_positive, shown
 from bigs.data.base import HandTrack
 from bigs.data.entries import array_entry, require
 from bigs.names import check_name
@@ -207,8 +207,7 @@ def read_depth_sigma(path: Path) -> float:
     """
     stored = read_stamped_npz(path)
     value = float(array_entry(f"{path}: depth_sigma", stored.get("depth_sigma", USUAL_DEPTH_SIGMA), ()))
-    if value <= 0:
-        raise InputError(f"{path}: depth_sigma: expected a positive number, found {value:g}")
+    check_positive(f"{path}: depth_sigma", value)
     return value
 
 
@@ -264,8 +263,7 @@ def read_alignment(path: Path, frames: int) -> Alignment:
     stored = read_stamped_npz(path)
     entry = _entries_of(path, stored, "")
     scale = float(entry("scale", ()))
-    if scale <= 0:
-        raise InputError(f"{path}: scale: expected a positive number, found {scale:g}")
+    check_positive(f"{path}: scale", scale)
     return Alignment(
         scale=scale,
         object_rotations=entry("object_rotations", (frames, 3, 3)),
@@ -327,8 +325,7 @@ def _pixels(file: Path, stored: Mapping[str, Any], key: str) -> int:
 
 def _number(file: Path, stored: Mapping[str, Any], key: str) -> float:
     value = float(array_entry(f"{file}: {key}", require(f"{file}: {key}", stored, key), ()))
-    if value <= 0:
-        raise InputError(f"{file}: {key}: expected a positive number, found {value:g}")
+    check_positive(f"{file}: {key}", value)
     return value
 
 

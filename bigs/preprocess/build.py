@@ -75,6 +75,7 @@ def write_build(
     hand_models: Mapping[Side, HandModel],
     sfm: ObjectSfm,
     alignment: Alignment,
+    fps: float,
     ours: bool,
 ) -> Path:
     """Write `clip/build`; the folder is whole or as it was.
@@ -90,6 +91,7 @@ def write_build(
         hand_models: both sides' models.
         sfm: the object's points.
         alignment: where everything is in metres.
+        fps: frames a second.
         ours: a `build` folder that is there was made by this function and may be replaced.
 
     Raises:
@@ -120,6 +122,7 @@ def write_build(
                 for side, track in hands.items()
             },
             object=object_in_world(sfm, alignment, shift),
+            fps=fps,
         )
         shutil.rmtree(build, ignore_errors=True)
         os.replace(scratch / "build", build)

@@ -43,6 +43,7 @@ from bigs.train.plan.config import (
     SplitStage,
     Stage,
 )
+from bigs.train.plan.rate import at_rate
 from bigs.train.resolve import asks_prior
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
@@ -117,6 +118,7 @@ def fit(
         FloatingPointError: a loss became infinite or not a number.
     """
     report = FitReport()
+    config = at_rate(config, clip.fps)
     _check_networks(config, perceptual, denoiser)
     torch.manual_seed(config.seed)
     watch = watch or Stopwatch("start values")

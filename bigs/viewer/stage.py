@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bigs.types import USUAL_FPS
+
 # (subject, knob) -> degrees; missing knobs are 0.
 Pose = Mapping[tuple[str, str], float]
 
@@ -51,4 +53,4 @@ class Stage:
     image: Callable[[int], np.ndarray] | None = None  # frame -> [H, W, 3] uint8
     truth: Callable[[int], Mapping[str, Mesh]] | None = None  # frame -> ground truth of every subject
     grasps: str = ""  # when hands hold the object, an SVG element
-    fps: float = 30.0
+    fps: float = USUAL_FPS  # frames a second

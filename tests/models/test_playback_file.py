@@ -52,6 +52,25 @@ def test_a_forged_scene_that_fits_is_read(forge: Callable[..., Path]) -> None:
     assert load_playback(forge({"name": "other"})).name == "other"
 
 
+def test_frames_a_second(whole: Path, forge: Callable[..., Path], tmp_path: Path) -> None:
+    slow = replace(load_playback(whole), fps=12.5)
+    save_playback(tmp_path / "slow.safetensors", slow)
+    assert load_playback(tmp_path / "slow.safetensors").fps == 12.5
+    for fps in (0.0, -1.0, float("nan"), "30", True, None):
+        with pytest.raises(InputError, match="fps: expected a positive number"):
+            load_playback(forge({"fps": fps}))
+
+
+def test_a_scene_of_before_there_were_frames_a_second(whole: Path, tmp_path: Path) -> None:
+    with safe_open(whole, framework="pt") as file:
+        facts = json.loads(file.metadata()["bigs"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    del facts["fps"], facts["checksum"]
+    facts["checksum"] = checksum(json.dumps(facts), tensors)
+    save_file(tensors, tmp_path / "scene.safetensors", {"bigs": json.dumps(facts)})
+    assert load_playback(tmp_path / "scene.safetensors").fps == 30.0
+
+
 def test_any_changed_byte_is_told(whole: Path, tmp_path: Path) -> None:
     content = whole.read_bytes()
     path = tmp_path / "scene.safetensors"

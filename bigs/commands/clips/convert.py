@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from bigs.checks import InputError
+from bigs.checks import InputError, check_positive
 from bigs.commands.clips.open import open_clip
 from bigs.commands.clips.truth import pose_annotation, read_annotation
 from bigs.data.base import Clip
@@ -34,6 +34,7 @@ class ConvertPlan:
 
     view: View = "full"  # limited: a quarter of the frames that shows the object from few sides
     every: int = 1  # keep every Nth frame
+    fps: float | None = None  # frames a second of the clip; None believes its files
     width: int = 0  # width of the images; 0 keeps theirs
     masks: Path | None = None  # label masks named like the images; the clip's own by default
     from_truth: bool = False  # start from a data set's ground truth
@@ -63,6 +64,8 @@ def convert(
         raise InputError(f"{out / 'build'}: expected no clip there yet, found one")
     if plan.every < 1 or plan.width < 0:
         raise InputError(f"--every, --width: expected at least 1 and 0, found {plan.every} and {plan.width}")
+    if plan.fps is not None:
+        check_positive("--fps", plan.fps)
     hand_models = load_hand_models(hand_model)
     clip = open_clip(source, hand_models)
     if clip.annotated and not plan.from_truth:
@@ -102,7 +105,8 @@ def _chosen(clip: Clip, plan: ConvertPlan) -> tuple[Clip, list[tuple[str, str]]]
         chosen, reach = limited_frames(object_directions(clip)[frames])
         frames = frames[chosen]
         notes.append(("view", f"limited: directions within {np.degrees(reach):.0f} degrees of one"))
-    return excerpt(clip, frames), notes
+    rate = clip.fps if plan.fps is None else plan.fps
+    return replace(excerpt(clip, frames), fps=rate / plan.every), notes
 
 
 def write_build_clip(
@@ -142,6 +146,7 @@ def write_build_clip(
             for side, track in clip.hands.items()
         },
         object=None if clip.object is None else move_object(clip.object, motions),
+        fps=clip.fps,
     )
 
 

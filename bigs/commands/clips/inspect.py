@@ -26,7 +26,7 @@ def describe_clip(path: Path, hand_model: Path | None = None) -> list[tuple[str,
     rows = [
         ("clip", f"{clip.name} ({clip.folder})"),
         ("layout", LAYOUT_NAMES[layout_of(path)]),
-        ("frames", f"{len(clip)}, {clip.width} x {clip.height}"),
+        ("frames", f"{len(clip)}, {clip.width} x {clip.height}, {clip.fps:.3g} a second"),
         ("camera", f"fx {K[0, 0]:.1f}, fy {K[1, 1]:.1f}, cx {K[0, 2]:.1f}, cy {K[1, 2]:.1f} pixels"),
     ]
     for entity, areas in clip.mask_areas.items():

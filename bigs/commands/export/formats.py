@@ -30,9 +30,6 @@ from bigs.models.playback_file import save_playback
 from bigs.models.repose import wrist_of
 from bigs.types import Entity, Gaussians, Side
 
-# Clips are taken to be videos of this rate, which no clip's files tell.
-FPS = 30.0
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -199,7 +196,7 @@ def _write_rig(folder: Path, playback: Playback, choice: Choice) -> Iterable[Pat
     path = _ready(folder / "scene.glb")
     hands = {side: _rigged(side, hand) for side, hand in playback.hands.items()}
     K, width, height = playback.K.numpy(), playback.width, playback.height
-    save_rig(path, hands, obj, K=K, width=width, height=height, fps=FPS)
+    save_rig(path, hands, obj, K=K, width=width, height=height, fps=playback.fps)
     yield path
 
 

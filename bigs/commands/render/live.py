@@ -83,6 +83,7 @@ def make_stage(playback: Playback, clip: Clip | None, truth: HandObjectTrajector
         image=None if clip is None else clip.image,
         truth=None if truth is None else _truth(playback, truth),
         grasps=grasp_timeline(playback),
+        fps=playback.fps,
     )
 
 

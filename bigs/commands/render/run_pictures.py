@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image
 
 from bigs.checks import InputError
-from bigs.commands.export.formats import FPS
 from bigs.commands.folder.contents import PREVIEW_PICTURE, PREVIEW_VIDEO, REPORT
 from bigs.commands.render.frame import orbit_camera, render_frame, render_input_view
 from bigs.data.base import Clip
@@ -60,7 +59,7 @@ def draw_pictures(out: Path, clip: Clip, playback: Playback) -> Drawn:
     kept: list[tuple[str, Image.Image]] = []
     strips = _ahead(_strips(clip, playback, kept))
     try:
-        write_video(out / PREVIEW_VIDEO, strips, FPS)
+        write_video(out / PREVIEW_VIDEO, strips, playback.fps)
     except InputError as missing:
         for _ in strips:
             pass

@@ -14,7 +14,6 @@ from PIL import Image
 
 from bigs.atomic import atomic_write
 from bigs.checks import InputError, check_pixels
-from bigs.commands.export.formats import FPS
 from bigs.commands.folder.contents import load_run
 from bigs.commands.render.frame import render_depth, render_frame, straight_rgba, turned_camera
 from bigs.data.formats.transforms import MOST_CAMERAS, MOST_PIXELS, RenderCamera
@@ -89,7 +88,7 @@ def render_run(
             pass
     else:
         wanted.video.parent.mkdir(parents=True, exist_ok=True)
-        write_video(wanted.video, frames, FPS if fps is None else fps)
+        write_video(wanted.video, frames, playback.fps if fps is None else fps)
         files.append(wanted.video)
     return files
 

@@ -64,7 +64,7 @@ class Curve:
 
     def _scores(self, scene: Scene) -> dict[str, float]:
         clip = self._clip
-        playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
+        playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift, clip.fps)
         scores = means(frame_scores(self._few, playback, at=self._frames))
         if self._truth is None:
             return scores

@@ -146,7 +146,7 @@ def reconstruct(
             watch.begin("results")
             if clip.notes:
                 report.facts["clip"] = "; ".join(clip.notes)
-            playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift)
+            playback = record(scene, clip.name, clip.frame_names, clip.normalize_shift, clip.fps)
             listen({"event": "note", "stage": "outputs", "text": "writing results"})
             write_outputs(out, playback)
             watch.begin("scores")

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, found_at
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.entries import array_entry, mapping_entry, number_entry, require
+from bigs.data.entries import array_entry, mapping_entry, positive_entry, require
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -31,7 +31,7 @@ from bigs.data.projection import CAMERA_TOLERANCE, decompose_projection
 from bigs.data.tracks import check_turns, fill_rotations, fill_vectors
 from bigs.files import read_text
 from bigs.names import check_name
-from bigs.types import ENTITIES, SIDES, Side
+from bigs.types import ENTITIES, SIDES, USUAL_FPS, Side
 from bigs.unpickle import load_npy
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
@@ -97,6 +97,8 @@ def load_hold(path: str | Path) -> Clip:
         scene_scale=scene_scale,
         normalize_shift=normalize_shift,
         mask_areas=decode_frames(image_paths, mask_paths, (width, height)),
+        # HOLD's own files do not say.
+        fps=positive_entry(f"{file}: fps", data["fps"]) if "fps" in data else USUAL_FPS,
     )
 
 
@@ -111,6 +113,7 @@ def write_hold(
     normalize_shift: np.ndarray,
     hands: Mapping[Side, HandTrack],
     object: ObjectTrack | None,
+    fps: float = USUAL_FPS,
     torch_norm_mat: bool = True,
 ) -> Path:
     """Write `folder/build` as HOLD's preprocessing leaves it.
@@ -125,6 +128,7 @@ def write_hold(
         normalize_shift: [3] metres; the tracks are in the world that it defines.
         hands: tracks of the hands that exist.
         object: the object's track.
+        fps: frames a second.
         torch_norm_mat: store `norm_mat` as a torch tensor, as HOLD does, or as a numpy array.
 
     Returns:
@@ -156,6 +160,7 @@ def write_hold(
         "max_radius_ratio": MAX_RADIUS_RATIO,
         "entities": entities,
         "normalize_shift": shift,
+        "fps": float(fps),
     }
     np.save(build / "data.npy", np.array(data, dtype=np.object_))
     return build
@@ -248,7 +253,7 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
         raise InputError(
             f"{where}.pts.cano: expected points that span a volume, found {len(points)} in a plane"
         )
-    scale = _read_scale(f"{where}.obj_scale", require(f"{where}.obj_scale", entity, "obj_scale"))
+    scale = positive_entry(f"{where}.obj_scale", require(f"{where}.obj_scale", entity, "obj_scale"))
     norm_mat = _entity_array(where, entity, "norm_mat", (4, 4))
     if not np.allclose(norm_mat[3], [0, 0, 0, 1]) or np.linalg.det(norm_mat[:3, :3]) < 1e-12:
         raise InputError(
@@ -267,13 +272,6 @@ def _read_object(where: str, entity: Any, frames: int) -> ObjectTrack:
         transl=fill_vectors(poses[:, 3:], valid),
         valid=valid,
     )
-
-
-def _read_scale(where: str, stored: Any) -> float:
-    scale = number_entry(where, stored)
-    if scale <= 0:
-        raise InputError(f"{where}: expected a positive number, found {scale:g}")
-    return scale
 
 
 def _read_colors(where: str, stored: Any, count: int) -> np.ndarray:

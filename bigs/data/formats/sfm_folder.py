@@ -27,7 +27,7 @@ from bigs.archives import read_npz
 from bigs.checks import InputError, check_finite, check_rotations, shown
 from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
-from bigs.data.entries import array_entry, mapping_entry, number_entry, require
+from bigs.data.entries import array_entry, mapping_entry, positive_entry, require
 from bigs.data.formats.colmap_files import check_model_files
 from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.formats.transforms import read_cameras
@@ -210,10 +210,7 @@ def _read_hands(file: Path, frames: int) -> tuple[dict[Side, HandTrack], float |
         raise InputError(f"{file}: expected right_transl or left_transl, found {', '.join(arrays)}")
     if "object_scale" not in arrays:
         return hands, None
-    scale = number_entry(f"{file}: object_scale", arrays["object_scale"])
-    if scale <= 0:
-        raise InputError(f"{file}: object_scale: expected a positive number, found {scale:g}")
-    return hands, scale
+    return hands, positive_entry(f"{file}: object_scale", arrays["object_scale"])
 
 
 def _read_hand(file: Path, arrays: Mapping[str, np.ndarray], side: Side, frames: int) -> HandTrack:

@@ -29,9 +29,8 @@ from bigs.data.synthetic.objects import (
 from bigs.data.synthetic.raycast import Body, Picture, require_embree, take_picture
 from bigs.data.synthetic.texture import fingernails, skin_tone
 from bigs.geometry.mesh import face_areas, vertex_normals
-from bigs.types import MASK_VALUES, SIDES, Side
+from bigs.types import MASK_VALUES, SIDES, USUAL_FPS, Side
 
-FPS = 30.0
 # A hand touches the object if its nearest vertex is no farther than this, metres.
 CONTACT = 0.003
 _SENSOR_NOISE = 1.3 / 255
@@ -123,7 +122,7 @@ def make_clip(
         # torch pickles the tensor's address; without it the files have the same bytes every time.
         torch_norm_mat=False,
     )
-    arrays: dict[str, Any] = {"K": K, "wh": np.array([width, height]), "fps": FPS}
+    arrays: dict[str, Any] = {"K": K, "wh": np.array([width, height]), "fps": USUAL_FPS}
     arrays |= _object_truth(object_guess, rotations, positions)
     for side in hands:
         arrays |= _hand_truth(

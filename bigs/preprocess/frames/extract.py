@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from bigs.atomic import atomic_write
-from bigs.checks import InputError
+from bigs.checks import InputError, check_positive
 from bigs.data.formats.arctic import meta_of_images
 from bigs.preprocess.artefacts import FRAMES, FRAMES_FILE, FrameSet, write_frame_set
 from bigs.preprocess.frames.camera import CameraRequest, find_camera, scale_camera
@@ -30,6 +30,7 @@ class FrameConfig:
     sharpest: bool = False  # keep the sharpest picture of each stride, not the first
     start: int = 0  # number of the first picture to use
     count: int = 0  # most frames to keep; 0 keeps all
+    fps: float | None = None  # of the source; None believes it
     max_size: int = 1280  # longer side in pixels to which larger frames are shrunk; 0 for none
     camera: CameraRequest = field(default_factory=CameraRequest)
 
@@ -40,6 +41,8 @@ class FrameConfig:
                 raise InputError(
                     f"{name}: expected an integer of at least {least}, found {getattr(self, name)}"
                 )
+        if self.fps is not None:
+            check_positive("fps", self.fps)
 
 
 def frame_inputs(source: Source, config: FrameConfig) -> str:
@@ -103,7 +106,7 @@ def extract_frames(
     width, height = _shrunk_size(*size, config.max_size)
     frames = FrameSet(
         names=tuple(names),
-        fps=source.fps / config.stride,
+        fps=(source.fps if config.fps is None else config.fps) / config.stride,
         width=width,
         height=height,
         K=scale_camera(camera.K, width / size[0], height / size[1]),

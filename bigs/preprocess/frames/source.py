@@ -15,6 +15,7 @@ from PIL import ExifTags, ImageOps
 from bigs.checks import InputError, check_pixels, found_at
 from bigs.data.images import open_picture
 from bigs.files import open_regular
+from bigs.types import USUAL_FPS
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -32,8 +33,6 @@ _HEAD_BYTES = 16
 _OPTIONS = {"mov": {"enable_drefs": "0", "use_absolute_path": "0"}}
 # An hour at 240 frames per second; a clip has hundreds of frames.
 _MAX_FRAMES = 864_000
-# Frame rate of a folder of images, which does not state one.
-FOLDER_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def open_source(path: Path) -> Source:
                 f"{path}: expected images ({', '.join(PICTURE_SUFFIXES)}), found none in this folder"
             )
         images = tuple(sorted(files, key=natural_order))
-        return Source(path, FOLDER_FPS, exif=_exif(images[0]), images=images)
+        return Source(path, USUAL_FPS, exif=_exif(images[0]), images=images)
     if not path.exists():
         raise InputError(f"{path}: expected a video file or a folder of images, found {found_at(path)}")
     av = _import_av(path)
@@ -108,7 +107,7 @@ def open_source(path: Path) -> Source:
             stream = container.streams.video[0]
             check_pixels(str(path), stream.width, stream.height)
             rate = stream.average_rate or stream.guessed_rate
-            return Source(path, float(rate) if rate else FOLDER_FPS, tags=dict(container.metadata))
+            return Source(path, float(rate) if rate else USUAL_FPS, tags=dict(container.metadata))
     except av.FFmpegError as error:
         raise InputError(f"{path}: expected a readable video, found {error.strerror or error}") from None
 

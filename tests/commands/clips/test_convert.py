@@ -100,6 +100,21 @@ def test_frames_and_size_can_be_chosen(tmp_path: Path, tiny: Clip, tiny_clip: Pa
     np.testing.assert_allclose(2 * pixels[0], pixels[1], atol=1e-3)
 
 
+def test_frames_a_second_go_on(
+    call: Callable[..., Answer], tmp_path: Path, tiny: Clip, tiny_clip: Path
+) -> None:
+    assert tiny.fps == 30.0
+    convert(tiny_clip, tmp_path / "half", ConvertPlan(every=2))
+    assert load_hold(tmp_path / "half").fps == 15.0
+    convert(tmp_path / "half", tmp_path / "sixth", ConvertPlan(every=3))
+    assert load_hold(tmp_path / "sixth").fps == 5.0
+    # Who knows better than the files says so, of the clip as it is.
+    assert call("convert", tiny_clip, "--out", tmp_path / "b", "--fps", "50", "--every", "2").code == 0
+    assert load_hold(tmp_path / "b").fps == 25.0
+    assert "6, 120 x 90, 25 a second" in call("info", tmp_path / "b").out
+    assert_refused(call("convert", tiny_clip, "--out", tmp_path / "c", "--fps", "0"), "--fps: expected", "0")
+
+
 def test_the_limited_view_is_a_quarter(call: Callable[..., Answer], tmp_path: Path, tiny_clip: Path) -> None:
     answer = call("convert", tiny_clip, "--out", tmp_path / "clip", "--view", "limited")
     assert answer.code == 0 and "limited: directions within" in answer.out

@@ -46,6 +46,14 @@ def test_what_is_written_is_read_back(write_small: Callable[..., Path], torch_no
         np.testing.assert_allclose(getattr(clip.object, field), getattr(obj, field), atol=1e-6)
 
 
+def test_frames_a_second(
+    write_small: Callable[..., Path], edit_data: Callable[[Callable[[dict[str, Any]], None]], Path]
+) -> None:
+    assert load_hold(write_small(fps=12.5)).fps == 12.5
+    # HOLD's own files do not say.
+    assert load_hold(edit_data(lambda data: data.pop("fps"))).fps == 30.0
+
+
 def test_images_and_masks_keep_their_order(write_small: Callable[..., Path]) -> None:
     images = np.random.default_rng(0).integers(0, 256, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8)
     clip = load_hold(write_small(images=images))

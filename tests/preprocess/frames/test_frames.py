@@ -68,6 +68,11 @@ def test_stride_start_and_count(folder: Path, tmp_path: Path) -> None:
     assert frames.fps == pytest.approx(15.0)
 
 
+def test_the_source_may_be_faster_or_slower_than_it_says(folder: Path, tmp_path: Path) -> None:
+    frames = extract(folder, tmp_path / "out", stride=2, fps=240.0)
+    assert frames.fps == 120.0 and read_frame_set(tmp_path / "out").fps == 120.0
+
+
 def test_the_sharpest_of_each_stride(folder: Path, tmp_path: Path) -> None:
     assert sharpness(picture(0)) > 4 * sharpness(picture(0, blur=True))
     frames = extract(folder, tmp_path / "out", stride=3, sharpest=True)
