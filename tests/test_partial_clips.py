@@ -115,11 +115,13 @@ def test_a_clip_of_fewer_frames_a_second(tiny_clip: Path, tmp_path: Path) -> Non
     other = load_file(tmp_path / "other" / "scene.safetensors")
     assert any(not np.array_equal(values, other[name]) for name, values in slow.items())
     av = pytest.importorskip("av")
-    turn = tmp_path / "turn.mp4"
-    render_run(tmp_path / "run", Shot(orbit=True, pictures=2), Wanted(video=turn))
-    for video in (tmp_path / "run" / "preview.mp4", turn):
+    own, still = tmp_path / "own.mp4", tmp_path / "still.mp4"
+    render_run(tmp_path / "run", Shot(from_input=True), Wanted(video=own))
+    # Where time stands still, no rate is the clip's.
+    render_run(tmp_path / "run", Shot(orbit=True, pictures=2), Wanted(video=still))
+    for video, rate in ((tmp_path / "run" / "preview.mp4", 10), (own, 10), (still, 30)):
         with av.open(str(video)) as container:
-            assert container.streams.video[0].average_rate == 10
+            assert container.streams.video[0].average_rate == rate
 
 
 @pytest.mark.parametrize("frames", [1, 2])

@@ -210,8 +210,8 @@ def render(
             own camera keep their vertical angle.
         world: frame of a file's cameras: the clip's camera frame (x right, y down, z forward; metres; the
             default), or the object's own frame, which moves with the object.
-        video: an .mp4 file of the pictures, at 30 frames a second or a camera path's rate; needs the extra
-            video.
+        video: an .mp4 file of the pictures, at the rate of a camera path or of the clip, or at 30 a second
+            where time stands still; needs the extra video.
         depth: also write OUT/depth/0000.png in 16-bit millimetres, or 0000.npy in metres; 0 where nothing is.
         background: white, black, R,G,B (each 0 to 255) or transparent, which is black in a video.
         threads: CPU threads; 0 uses all cores.

@@ -19,7 +19,7 @@ from bigs.commands.render.frame import render_depth, render_frame, straight_rgba
 from bigs.data.formats.transforms import MOST_CAMERAS, MOST_PIXELS, RenderCamera
 from bigs.data.render_cameras import CameraPath, load_cameras
 from bigs.models.playback import Playback
-from bigs.types import Entity
+from bigs.types import USUAL_FPS, Entity
 from bigs.viewer.preview import save_picture, to_bytes, write_video
 
 # Pictures of an orbit of one frame: four seconds.
@@ -88,7 +88,10 @@ def render_run(
             pass
     else:
         wanted.video.parent.mkdir(parents=True, exist_ok=True)
-        write_video(wanted.video, frames, playback.fps if fps is None else fps)
+        if fps is None:
+            plays = len({camera.frame_index for camera in cameras}) > 1
+            fps = playback.fps if plays else USUAL_FPS
+        write_video(wanted.video, frames, fps)
         files.append(wanted.video)
     return files
 
