@@ -86,9 +86,12 @@ def find_grasps(
         own.has_expected_depth.copy_(~grasped & grasped.any())
         if grasped.any():
             log_depth = poses.wrist[:, 2].log()
-            own.expected_log_depth.copy_(expected_depths(log_depth, own.estimated_log_depth, grasped))
+            own.expected_log_depth.copy_(
+                expected_depths(log_depth, own.estimated_log_depth, grasped, stage.alike)
+            )
             correction = matrix_to_axis_angle(own.estimated_pose.transpose(-1, -2) @ poses.hand_pose)
-            corrected = own.estimated_pose @ axis_angle_to_matrix(carried_errors(correction, grasped))
+            carried = carried_errors(correction, grasped, stage.alike)
+            corrected = own.estimated_pose @ axis_angle_to_matrix(carried)
             poses = poses._replace(
                 hand_pose=torch.where(grasped[:, None, None, None], poses.hand_pose, corrected)
             )
@@ -244,7 +247,7 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
     return orient
 
 
-def expected_depths(log_depth: Tensor, estimated: Tensor, grasped: Tensor) -> Tensor:
+def expected_depths(log_depth: Tensor, estimated: Tensor, grasped: Tensor, alike: float) -> Tensor:
     """Logarithmic depths [T] that frames outside grasps are expected to have.
 
     An outline says little of the depth of a hand that the image cuts off. Two guesses with unrelated errors
@@ -256,26 +259,27 @@ def expected_depths(log_depth: Tensor, estimated: Tensor, grasped: Tensor) -> Te
         log_depth: [T] as found; only those of grasps are read.
         estimated: [T] before any image was looked at.
         grasped: [T] bool, which frames are in grasps; at least one.
+        alike: see `carried_errors`.
     """
     times = np.arange(len(grasped))
     known = grasped.numpy()
     between = torch.from_numpy(np.interp(times, times[known], log_depth.numpy()[known])).to(log_depth)
-    carried = estimated + carried_errors(log_depth - estimated, grasped)
+    carried = estimated + carried_errors(log_depth - estimated, grasped, alike)
     first, last = times[known][[0, -1]]
     share = torch.from_numpy(np.where((times < first) | (times > last), 0.25, 0.5)).to(log_depth)
     return share * between + (1.0 - share) * carried
 
 
-def carried_errors(errors: Tensor, known: Tensor, width: float = 10.0, noise: float = 1.0) -> Tensor:
+def carried_errors(errors: Tensor, known: Tensor, alike: float, noise: float = 1.0) -> Tensor:
     """Errors of other frames predicted from known ones by Gaussian-process regression over time.
 
     Estimators err alike in frames near each other, and to a part in all frames of a clip: the covariance of
-    two frames is a constant plus a bell of `width` frames, of equal weight.
+    two frames is a constant plus a bell of `alike` frames, of equal weight.
 
     Args:
         errors: [T, ...] in any unit; only those of `known` frames are read.
         known: [T] bool, at least one.
-        width: of the bell, in frames.
+        alike: width of the bell, in frames.
         noise: standard deviation of a known error relative to that of either part.
 
     Returns:
@@ -285,7 +289,7 @@ def carried_errors(errors: Tensor, known: Tensor, width: float = 10.0, noise: fl
     seen = times[known]
 
     def covariance(a: Tensor, b: Tensor) -> Tensor:
-        return 1.0 + torch.exp(-0.5 * ((a[:, None] - b) / width) ** 2)
+        return 1.0 + torch.exp(-0.5 * ((a[:, None] - b) / alike) ** 2)
 
     gram = covariance(seen, seen) + noise**2 * torch.eye(len(seen), dtype=errors.dtype)
     weights = torch.linalg.solve(gram, errors[known].reshape(len(seen), -1))

@@ -91,6 +91,8 @@ class GraspStage:
     rounds: int = 2
     # A hand that changes its grasp within this many frames turns evenly from one to the next.
     longest_move: int = 16
+    # Estimators err alike in frames that are so near each other (see `find.carried_errors`).
+    alike: float = 10.0
     # Factor on the residuals that a frame of a grasp adds to it; 0 makes grasps rigid.
     slack: float = 0.1
 

@@ -110,7 +110,7 @@ RANGES: dict[type, dict[str, Range]] = {
     },
     GraspStage: {
         "least": Range(2, 10**9),
-        **dict.fromkeys(("free", "excess", "error_aside", "error_along"), _POSITIVE),
+        **dict.fromkeys(("free", "excess", "error_aside", "error_along", "alike"), _POSITIVE),
         "image_size": _PIXELS,
     },
     MoveStage: {"image_size": _PIXELS, "best": _COUNT, "gain": _SHARE, "loose_gain": _SHARE},

@@ -45,6 +45,7 @@ def _stage_at(stage: Stage, rate: float) -> Stage:
             least=_frames(stage.least, rate, 2),
             gap=_frames(stage.gap, rate, 1),
             longest_move=_frames(stage.longest_move, rate, 2),
+            alike=stage.alike * rate,
         )
     if isinstance(stage, MoveStage):
         stage = replace(stage, loose_frames=_frames(stage.loose_frames, rate, 1))

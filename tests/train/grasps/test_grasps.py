@@ -164,10 +164,12 @@ def test_known_errors_are_carried_to_their_neighbours_and_fade_to_the_mean() -> 
     known = torch.zeros(60, dtype=torch.bool)
     known[:10] = known[50:] = True
     errors = torch.where(torch.arange(60) < 30, 1.0, -1.0)[:, None].repeat(1, 2)
-    carried = carried_errors(errors, known, noise=0.1)
+    carried = carried_errors(errors, known, 10.0, noise=0.1)
     assert carried[11].min() > 0.8 and carried[48].max() < -0.8
     torch.testing.assert_close(carried[29] + carried[30], torch.zeros(2), atol=1e-4, rtol=0)
-    constant = carried_errors(torch.ones(60, 2), known, noise=0.1)
+    narrower = carried_errors(errors, known, 3.0, noise=0.1)
+    assert narrower[15].max() < 0.5 * carried[15].min(), "fewer frames are alike"
+    constant = carried_errors(torch.ones(60, 2), known, 10.0, noise=0.1)
     assert (constant - 1.0).abs().max() < 0.25, "what every known frame shows, all have"
 
 
@@ -178,7 +180,7 @@ def test_the_depth_between_grasps_is_halfway_between_the_two_guesses() -> None:
     wave = 0.1 * torch.sin(torch.arange(30.0))
     # An estimate that is wrong by the same everywhere, and one that wavers: half of its waver is believed.
     for estimated, believed in ((true + 0.2, torch.zeros(30)), (true + 0.2 + wave * ~grasped, 0.5 * wave)):
-        expected = expected_depths(true, estimated, grasped)
+        expected = expected_depths(true, estimated, grasped, 10.0)
         torch.testing.assert_close(expected[~grasped], (true + believed)[~grasped], atol=0.02, rtol=0)
 
 
@@ -187,7 +189,7 @@ def test_beyond_the_grasps_the_estimate_is_believed_more() -> None:
     grasped = torch.zeros(30, dtype=torch.bool)
     grasped[12:18] = True
     true = torch.where(grasped, -0.4, -0.2)
-    expected = expected_depths(torch.full((30,), -0.4), true + 0.05, grasped)
+    expected = expected_depths(torch.full((30,), -0.4), true + 0.05, grasped, 10.0)
     torch.testing.assert_close(expected[~grasped], torch.full((24,), -0.25), atol=0.03, rtol=0)
 
 

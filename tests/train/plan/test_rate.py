@@ -51,7 +51,7 @@ def test_a_second_holds_half_as_many_frames() -> None:
         usual.smooth_object / 2,
     )
     grasps = next(s for s in plan.stages if isinstance(s, GraspStage))
-    assert (grasps.least, grasps.gap, grasps.longest_move) == (2, 3, 8)
+    assert (grasps.least, grasps.gap, grasps.longest_move, grasps.alike) == (2, 3, 8, 5.0)
     # The price of a grasp is that of some frames, and that of a frame stays.
     assert (grasps.grasp, grasps.free) == (GraspStage().grasp / 2, GraspStage().free)
     assert next(s for s in plan.stages if isinstance(s, MoveStage)).loose_frames == 1
@@ -62,8 +62,8 @@ def test_few_frames_a_second_still_make_a_grasp() -> None:
     assert isinstance(grasps, GraspStage)
     assert (grasps.least, grasps.gap, grasps.longest_move) == (2, 1, 2)
     # Who asks for less than that keeps it.
-    grasps = stage_at(3.0, GraspStage(least=1, gap=0))
-    assert isinstance(grasps, GraspStage) and (grasps.least, grasps.gap) == (1, 0)
+    grasps = stage_at(3.0, GraspStage(least=2, gap=0))
+    assert isinstance(grasps, GraspStage) and (grasps.least, grasps.gap) == (2, 0)
 
 
 def test_other_weights_stay() -> None:
