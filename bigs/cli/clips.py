@@ -28,7 +28,7 @@ def convert(
         out: folder to make.
         view: full, or the paper's limited view: a quarter of the frames that shows the object from few sides.
         every: keep every Nth frame.
-        fps: frames a second of the clip; by default what its files say, and 30 if they do not.
+        fps: frames a second of the clip; by default what its files or its frames' numbers say.
         width: width of the images; 0 keeps theirs.
         masks: folder of label masks (0, 50 object, 150 right, 250 left) named like the images; the clip's own
             by default.

@@ -35,7 +35,7 @@ class FrameOptions:
     count: int = 0
     """Stop after this many frames; 0 keeps all."""
     fps: float | None = None
-    """Frames a second of the source; by default what a video says, and 30 for a folder of images."""
+    """Frames a second of the source; by default what a video, or the numbers of images, say."""
     max_size: int = 1280
     """Shrink larger pictures to this many pixels on the longer side; 0 keeps their size."""
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from bigs.checks import InputError, found_at
 from bigs.data.base import Clip, HandTrack, ObjectTrack
 from bigs.data.entries import array_entry, mapping_entry, positive_entry, require
+from bigs.data.frame_rate import rate_by_names
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -98,7 +99,7 @@ def load_hold(path: str | Path) -> Clip:
         normalize_shift=normalize_shift,
         mask_areas=decode_frames(image_paths, mask_paths, (width, height)),
         # HOLD's own files do not say.
-        fps=positive_entry(f"{file}: fps", data["fps"]) if "fps" in data else USUAL_FPS,
+        fps=positive_entry(f"{file}: fps", data["fps"]) if "fps" in data else rate_by_names(frame_names),
     )
 
 

@@ -31,6 +31,7 @@ from bigs.data.entries import array_entry, mapping_entry, positive_entry, requir
 from bigs.data.formats.colmap_files import check_model_files
 from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
 from bigs.data.formats.transforms import read_cameras
+from bigs.data.frame_rate import rate_by_names
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
@@ -104,6 +105,7 @@ def load_sfm_folder(path: str | Path) -> Clip:
         scene_scale=1.0 / (RADIUS_PER_SHIFT * float(np.linalg.norm(shift))),
         normalize_shift=shift,
         mask_areas=areas,
+        fps=rate_by_names([file.name for file in image_paths]),
     )
 
 

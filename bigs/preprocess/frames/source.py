@@ -13,6 +13,7 @@ import numpy as np
 from PIL import ExifTags, ImageOps
 
 from bigs.checks import InputError, check_pixels, found_at
+from bigs.data.frame_rate import rate_by_names
 from bigs.data.images import open_picture
 from bigs.files import open_regular
 from bigs.types import USUAL_FPS
@@ -96,7 +97,7 @@ def open_source(path: Path) -> Source:
                 f"{path}: expected images ({', '.join(PICTURE_SUFFIXES)}), found none in this folder"
             )
         images = tuple(sorted(files, key=natural_order))
-        return Source(path, USUAL_FPS, exif=_exif(images[0]), images=images)
+        return Source(path, rate_by_names([image.name for image in images]), exif=_exif(images[0]), images=images)
     if not path.exists():
         raise InputError(f"{path}: expected a video file or a folder of images, found {found_at(path)}")
     av = _import_av(path)

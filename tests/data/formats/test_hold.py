@@ -50,8 +50,11 @@ def test_frames_a_second(
     write_small: Callable[..., Path], edit_data: Callable[[Callable[[dict[str, Any]], None]], Path]
 ) -> None:
     assert load_hold(write_small(fps=12.5)).fps == 12.5
-    # HOLD's own files do not say.
-    assert load_hold(edit_data(lambda data: data.pop("fps"))).fps == 30.0
+    # HOLD's own files do not say, but number the frames of a video.
+    folder = edit_data(lambda data: data.pop("fps"))
+    assert load_hold(folder).fps == 30.0
+    (folder / "build" / "corres.txt").write_text("".join(f"{5 * t:05d}.jpg\n" for t in range(FRAMES)))
+    assert load_hold(folder).fps == 6.0
 
 
 def test_images_and_masks_keep_their_order(write_small: Callable[..., Path]) -> None:

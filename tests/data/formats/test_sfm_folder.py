@@ -74,6 +74,18 @@ def test_the_clip_is_the_same(
         np.testing.assert_array_equal(clip.mask(t), tiny.mask(t))
 
 
+def test_numbers_that_are_left_out_tell_the_rate(tmp_path: Path, in_camera: Clip) -> None:
+    assert load_sfm_folder(write_nerfstudio(tmp_path / "clip", in_camera)).fps == 30.0
+    for kind in ("images", "masks"):
+        for file in sorted((tmp_path / "clip" / kind).iterdir(), reverse=True):
+            file.rename(file.with_stem(f"{3 * int(file.stem):04d}"))
+    document = (tmp_path / "clip" / "transforms.json").read_text()
+    for t in range(len(in_camera) - 1, -1, -1):
+        document = document.replace(f"images/{t:04d}.png", f"images/{3 * t:04d}.png")
+    (tmp_path / "clip" / "transforms.json").write_text(document)
+    assert load_sfm_folder(tmp_path / "clip").fps == 10.0
+
+
 def test_colmap_itself_reads_the_model(tmp_path: Path, in_camera: Clip) -> None:
     """Points fall where COLMAP's own projection puts them; a binary model is the same clip."""
     folder = write_colmap(tmp_path / "clip", in_camera)

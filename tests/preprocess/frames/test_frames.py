@@ -73,6 +73,13 @@ def test_the_source_may_be_faster_or_slower_than_it_says(folder: Path, tmp_path:
     assert frames.fps == 120.0 and read_frame_set(tmp_path / "out").fps == 120.0
 
 
+def test_images_of_which_some_were_left_out(folder: Path, tmp_path: Path) -> None:
+    for file in folder.iterdir():
+        if int(file.stem.removeprefix("shot")) % 2:
+            file.unlink()
+    assert extract(folder, tmp_path / "out").fps == 15.0
+
+
 def test_the_sharpest_of_each_stride(folder: Path, tmp_path: Path) -> None:
     assert sharpness(picture(0)) > 4 * sharpness(picture(0, blur=True))
     frames = extract(folder, tmp_path / "out", stride=3, sharpest=True)
