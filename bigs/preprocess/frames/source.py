@@ -97,7 +97,8 @@ def open_source(path: Path) -> Source:
                 f"{path}: expected images ({', '.join(PICTURE_SUFFIXES)}), found none in this folder"
             )
         images = tuple(sorted(files, key=natural_order))
-        return Source(path, rate_by_names([image.name for image in images]), exif=_exif(images[0]), images=images)
+        rate = rate_by_names([image.name for image in images])
+        return Source(path, rate, exif=_exif(images[0]), images=images)
     if not path.exists():
         raise InputError(f"{path}: expected a video file or a folder of images, found {found_at(path)}")
     av = _import_av(path)
