@@ -22,6 +22,7 @@ from bigs.train.grasps.search import (
     frame_errors,
     grasps_by_estimates,
     grasps_by_frames,
+    joined,
 )
 from bigs.train.plan.config import GraspStage
 from bigs.types import Side
@@ -141,11 +142,9 @@ def _search(
                 or [np.zeros((0, scene.n_frames))]
             ).reshape(len(hypotheses), scene.n_frames)
             by_estimate = _estimate_costs(points, information, hypotheses)
-            costs = prices.free * pictures / stage.excess + _ESTIMATE_SHARE * np.minimum(
-                by_estimate, prices.free
-            )
-            costs = np.maximum(costs, apart)
-            again = grasps_by_frames(costs, prices)
+            pictures = prices.free * pictures / stage.excess
+            costs = np.maximum(pictures + _ESTIMATE_SHARE * np.minimum(by_estimate, prices.free), apart)
+            again = joined(grasps_by_frames(costs, prices), np.maximum(pictures, apart), prices)
             settled = [s.frames for s in again] == [s.frames for s in stretches]
             stretches = again
             if settled:

@@ -18,6 +18,8 @@ _MOST = 2.5
 _STRAY = 3.0
 # ... within this many frames on either side, most of which agree.
 _NEIGHBOURS = 3
+# A frame agrees for sure with a grasp in which it costs no more than this, relative to one outside.
+_SURE = 0.5
 # Longer grasps are found in parts, which bounds the work for long clips.
 _LONGEST = 400
 
@@ -133,6 +135,35 @@ def grasps_by_frames(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     return _cheapest(stretches, prices)
 
 
+def joined(stretches: list[Stretch], pictures: np.ndarray, prices: Prices) -> list[Stretch]:
+    """The grasps, with those as one between which pictures show no letting go.
+
+    Estimators err alike for many frames, so that a hand may seem to hold the object in two ways, one after
+    the other. But whoever changes a grasp is seen to leave the object. If one hand that the object carries
+    fits the masks in both grasps and in each frame between them, it is one grasp.
+
+    Args:
+        stretches: in order.
+        pictures: [H, T] what each frame pays under each hypothesis, as far as pictures tell.
+        prices: in the same unit.
+    """
+    pictures = np.minimum(pictures, _MOST * prices.free)
+    found: list[Stretch] = []
+    for stretch in stretches:
+        found.append(stretch)
+        if len(found) < 2:
+            continue
+        before, after = found[-2:]
+        whole = range(before.frames.start, after.frames.stop)
+        between = range(before.frames.stop, after.frames.start)
+        together = pictures[:, whole].sum(axis=1)
+        together[pictures[:, between].max(axis=1, initial=-np.inf) > _SURE * prices.free] = np.inf
+        apart = sum(pictures[hypothesis, frames].sum() for frames, hypothesis in (before, after))
+        if together.min() < apart + prices.free * len(between) + prices.grasp:
+            found[-2:] = [Stretch(whole, int(together.argmin()))]
+    return found
+
+
 def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     """The cheapest cut, given what every stretch costs under every hypothesis: [H, T, T + 1]."""
     count = costs.shape[1]
@@ -174,7 +205,7 @@ def _priced(costs: np.ndarray, prices: Prices) -> np.ndarray:
     that the grasp goes on.
     """
     count = costs.shape[1]
-    sure = 0.5 * prices.free
+    sure = _SURE * prices.free
     came, goes = costs[:, 0, 1] <= sure, costs[:, -1, -1] <= sure
     costs = costs + prices.grasp
     costs[came, 0] -= 0.5 * prices.grasp

@@ -10,9 +10,11 @@ import pytest
 from bigs.train.grasps.find import _hypotheses
 from bigs.train.grasps.search import (
     Prices,
+    Stretch,
     certainties,
     grasps_by_estimates,
     grasps_by_frames,
+    joined,
     still_costs,
     stray_frames,
 )
@@ -157,6 +159,38 @@ def test_hypotheses_compete_for_frames() -> None:
     found = grasps_by_frames(costs, Prices(1.0, 2.0, 4, 5))
     assert found == [(range(0, 18), 0), (range(26, 40), 2)], "two faulty frames are bridged"
     assert grasps_by_frames(np.zeros((0, 40)), PRICES) == []
+
+
+def test_a_grasp_that_no_picture_shows_to_end_is_one() -> None:
+    # Estimates had the hand in two ways: each hypothesis fits its own part, and the third fits everywhere.
+    pictures = np.full((3, 40), 9.0)
+    pictures[0, :15], pictures[1, 20:], pictures[2] = 0.2, 0.2, 0.7
+    apart = [Stretch(range(0, 15), 0), Stretch(range(20, 40), 1)]
+    assert joined(apart, pictures, PRICES) == [(range(0, 40), 2)]
+    for change, why in (
+        ((2, slice(17, 18), 1.6), "once between them the hand is seen elsewhere"),
+        ((2, slice(0, 15), 2.4), "what fits between them does not fit the grasps"),
+        ((slice(None), slice(15, 20), 3.0), "between them the hand does not touch"),
+    ):
+        changed = pictures.copy()
+        changed[change[0], change[1]] = change[2]
+        assert joined(apart, changed, PRICES) == apart, why
+    # A faulty mask within a grasp says no more than that it is faulty.
+    pictures[2], pictures[2, 30] = 0.4, 1e6
+    assert joined(apart, pictures, PRICES) == [(range(0, 40), 2)]
+
+
+def test_many_grasps_become_one_and_those_beside_them_stay() -> None:
+    pictures = np.full((5, 60), 9.0)
+    for hypothesis, start in enumerate((0, 12, 24, 45)):
+        pictures[hypothesis, start : start + 7] = 0.1
+    pictures[4, :31] = 0.3
+    stretches = [Stretch(range(start, start + 7), h) for h, start in enumerate((0, 12, 24, 45))]
+    assert joined(stretches, pictures, PRICES) == [(range(0, 31), 4), (range(45, 52), 3)]
+    assert joined([], pictures, PRICES) == [] and joined(stretches[:1], pictures, PRICES) == stretches[:1]
+    # Grasps may follow each other at once where no gap is asked for.
+    close = [Stretch(range(0, 7), 0), Stretch(range(7, 12), 1)]
+    assert joined(close, pictures, PRICES._replace(gap=0)) == [(range(0, 12), 4)]
 
 
 @pytest.mark.parametrize(("last", "held"), [(0.3, True), (0.9, False)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -124,6 +125,29 @@ def test_pictures_give_a_grasp_the_frames_that_faulty_estimates_lost() -> None:
     error = (scene.at(ALL).joints("right") - truth.at(ALL).joints("right")).norm(dim=-1)
     assert error.max() < 0.002
     torch.testing.assert_close(scene.grasps["right"].certainty, found.certainty)
+
+
+@pytest.mark.parametrize("ends", ["", "seen to leave", "without touch"])
+def test_estimates_alone_make_no_two_grasps_of_one(ends: str) -> None:
+    """The estimates are beside each other before and after; masks allow either."""
+    scene, stage = turning_scene(), replace(STAGE, gap=2, grasp=4.0)
+    aside = 0.05 * ((ALL - 11.5) / 3).clamp(0, 1)
+    with torch.no_grad():
+        at = scene.at(ALL)
+        beside = at.hand("right").wrist + aside[:, None] * at.object.rotations[..., 0]
+        scene.hand_poses["right"].position.restart(beside)
+    between = (ALL >= 12) & (ALL < 14)
+    touching = {**EVERYWHERE, "right": (~between).float()} if ends == "without touch" else EVERYWHERE
+
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
+        carried = not torch.equal(poses.wrist, scene.at(ALL).hand(side).wrist)
+        leaves = between[frames] if ends == "seen to leave" and carried else torch.zeros(FRAMES)
+        return torch.where(leaves > 0, 1.0, 0.02)
+
+    alone = find_grasps(copy.deepcopy(scene), stage, touching)["right"]
+    assert len(alone.stretches) == 2
+    found = find_grasps(scene, stage, touching, mismatch)["right"]
+    assert len(found.stretches) == (2 if ends else 1)
 
 
 def test_pictures_drop_a_grasp_that_they_contradict() -> None:
