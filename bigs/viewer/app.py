@@ -120,7 +120,8 @@ class Viewer:
             with gui.add_folder("Time"):
                 self._frame = self._watched(gui.add_slider("frame", 0, stage.frames - 1, 1, 0))
                 self._playing = self._watched(gui.add_checkbox("play", False))
-                self._fps = gui.add_slider("frames a second", 1, 60, 1, round(stage.fps))
+                rate = max(1, round(stage.fps))
+                self._fps = gui.add_slider("frames a second", 1, max(60, rate), 1, rate)
                 if stage.grasps:
                     gui.add_html(f"<div>Hands hold the object:{stage.grasps}</div>")
         with gui.add_folder("Show"):

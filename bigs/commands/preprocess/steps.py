@@ -192,7 +192,7 @@ def build_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
     stamp, picture = processed / BUILD_FILE, processed / "build.png"
     parts = [processed / name for name in (FRAMES_FILE, MASKS, HANDS_FILE, SFM_FILE, ALIGNED_FILE)]
     config = SurfacePointsConfig()
-    inputs = content_digest(*parts, frames.K, frames.fps, _model_identity(request), asdict(config))
+    inputs = content_digest(*parts, frames.K, _model_identity(request), asdict(config))
     ours = stamp.exists()
     if request.state(stamp, inputs) == "current" and (request.clip / "build" / "data.npy").is_file():
         return kept("build", "current", str(request.clip / "build"), picture)
