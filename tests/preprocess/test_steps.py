@@ -91,10 +91,11 @@ def test_the_clip_is_what_the_truth_says(
 
 @pytest.mark.slow
 def test_hold_reads_the_data(made: tuple[Path, list[StepOutcome]], given: Given) -> None:
-    """Every key of HOLD's own file, and the object's points where HOLD's formulas put them."""
+    """Every key of HOLD's own file and the rate, and the object's points where HOLD's formulas put them."""
     data = load_npy(made[0] / "build" / "data.npy")
     assert data.keys() == {
         "seq_name", "cameras", "scene_bounding_sphere", "max_radius_ratio", "entities", "normalize_shift",
+        "fps",
     }  # fmt: skip
     entities = data["entities"]
     assert entities["object"].keys() >= {"obj_scale", "pts.cano", "norm_mat", "object_poses"}

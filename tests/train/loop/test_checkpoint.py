@@ -23,7 +23,7 @@ from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.fit import fit
 from bigs.train.loop.checkpoint import FILE_NAME, load_checkpoint, save_checkpoint
-from bigs.train.plan.config import OptimizeStage, RunConfig
+from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, Stage
 from bigs.train.plan.presets import SMOKE
 from bigs.train.resolve import resolve
 from bigs.types import Side
@@ -31,11 +31,14 @@ from bigs.types import Side
 
 def short_plan() -> RunConfig:
     """Every kind of stage of the smoke preset, four steps each; three steps between checkpoints."""
-    stages = tuple(
-        replace(stage, steps=4, image_size=40) if isinstance(stage, OptimizeStage) else stage
-        for stage in copy.deepcopy(SMOKE.stages)
-        if stage.name != "hands-fine"
-    )
+
+    def short(stage: Stage) -> Stage:
+        if isinstance(stage, OptimizeStage):
+            return replace(stage, steps=4, image_size=40)
+        # Hands hold the bottle all the time. Stricter grasps leave frames to the stage of those without.
+        return replace(stage, excess=0.2) if isinstance(stage, GraspStage) else stage
+
+    stages = tuple(short(stage) for stage in copy.deepcopy(SMOKE.stages) if stage.name != "hands-fine")
     return resolve(replace(SMOKE, stages=stages, checkpoint_every=3)).config
 
 
