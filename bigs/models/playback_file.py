@@ -20,6 +20,7 @@ from bigs.checks import (
     check_faces,
     check_finite,
     check_pixels,
+    check_positive,
     check_product,
     check_rotations,
     check_shape,
@@ -166,10 +167,8 @@ def _check(where: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) 
             raise InputError(f"{where}: {name}: expected indices below {count}, found {tips.tolist()}")
     for name in [name for name in shapes if name.endswith((".rotations", ".hand_pose"))]:
         check_rotations(f"{where}: {name}", tensors[name])
-    if "object.scale" in shapes and tensors["object.scale"] <= 0.0:
-        raise InputError(
-            f"{where}: object.scale: expected a positive number, found {tensors['object.scale']:g}"
-        )
+    if "object.scale" in shapes:
+        check_positive(f"{where}: object.scale", float(tensors["object.scale"]))
 
 
 def _check_facts(where: str, facts: Mapping[str, Any]) -> None:

@@ -17,6 +17,8 @@ NUMBERED = [f"{t:05d}.jpg" for t in range(100, 130)]
         # A few dropped frames more change nothing.
         ([*NUMBERED[:10], *NUMBERED[13:]], 30.0),
         ([f"take2_frame{t}.png" for t in range(0, 60, 2)], 15.0),
+        ([f"{t}.png" for t in range(0, 100, 10)], 3.0),
+        ([f"{t}.png" for t in range(0, 110, 11)], 30.0),
         # No frame numbers: times, other pictures, an order of their own, none at all.
         ([f"{t}.png" for t in range(0, 3000, 100)], 30.0),
         (NUMBERED[::-2], 30.0),

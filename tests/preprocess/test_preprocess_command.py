@@ -74,6 +74,13 @@ def test_the_steps_by_themselves(call: Call, given: Given, tmp_path: Path) -> No
     assert whole.code == 0 and "  made" not in whole.out
 
 
+def test_the_rate_is_said_on_the_command_line(call: Call, given: Given, tmp_path: Path) -> None:
+    clip = tmp_path / "clip"
+    command = ["frames", str(given.pictures), "--out", str(clip), "--fps", "24", "--stride", "2"]
+    assert "at 12 a second" in call("preprocess", *command).out
+    assert json.loads((clip / "processed" / "frames.json").read_text())["fps"] == 12.0
+
+
 def test_labels_of_masks_are_said_on_the_command_line(call: Call, given: Given, tmp_path: Path) -> None:
     clip = tmp_path / "clip"
     assert call("preprocess", "frames", str(given.pictures), "--out", str(clip)).code == 0

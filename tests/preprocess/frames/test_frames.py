@@ -238,6 +238,8 @@ def test_a_colmap_camera_that_took_no_picture(
     [
         ({"stride": 5}, "expected at least 4 frames, found 2 of 10 pictures"),
         ({"stride": 0}, "stride: expected an integer of at least 1, found 0"),
+        ({"fps": 0.0}, "fps: expected a positive number, found 0"),
+        ({"fps": float("nan")}, "fps: expected a positive number, found nan"),
         ({"camera": CameraRequest(focal=-3.0)}, "focal: expected a positive number"),
         ({"camera": CameraRequest(focal=1e300)}, "focal: expected a positive number"),
         ({"camera": CameraRequest(K=(1e300, 100, 50, 10))}, "positive focal lengths"),

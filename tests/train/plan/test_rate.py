@@ -66,6 +66,11 @@ def test_few_frames_a_second_still_make_a_grasp() -> None:
     assert isinstance(grasps, GraspStage) and (grasps.least, grasps.gap) == (2, 0)
 
 
+def test_steps_from_frame_to_frame_may_be_longer() -> None:
+    assert weight_at(15.0, "rigid") == weight_at(15.0, "smooth") == 0.5
+    assert weight_at(15.0, "acceleration") == weight_at(15.0, "object_acceleration") == 0.125
+
+
 def test_other_weights_stay() -> None:
     for before, after in zip(FAST.stages, at_rate(FAST, 15.0).stages, strict=True):
         if isinstance(before, OptimizeStage | MoveStage):
