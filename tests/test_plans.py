@@ -17,8 +17,12 @@ from short_plans import short
 from small_vgg import torchvision_state
 
 from bigs.commands.run.reconstruct import reconstruct
+from bigs.data.base import Clip
+from bigs.hand import HandModel
+from bigs.train.fit import fit
 from bigs.train.plan.config import CompletionStage, GuidanceStage, OptimizeStage
 from bigs.train.plan.presets import PRESETS
+from bigs.types import Side
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +54,27 @@ def test_hands_may_be_kept_apart(tiny_clip: Path, tmp_path: Path) -> None:
     written = load_file(tmp_path / "run" / "scene.safetensors")
     assert not np.array_equal(written["right.splats.colors"], written["left.splats.colors"])
     assert not np.array_equal(written["right.betas"], written["left.betas"])
+
+
+def test_a_plan_follows_the_pace_of_a_clip_before_its_rate(
+    tiny: Clip, both_hands: dict[Side, HandModel]
+) -> None:
+    hands = next(s for s in PRESETS["fast"].stages if isinstance(s, OptimizeStage))
+    plan = replace(
+        PRESETS["smoke"],
+        stages=(replace(hands, steps=2, image_size=32),),
+        hand=replace(PRESETS["smoke"].hand, subdivisions=0),
+        object=replace(PRESETS["smoke"].object, n_gaussians=100),
+        initial=replace(PRESETS["smoke"].initial, surface_resolution=20),
+    )
+
+    def depths(clip: Clip) -> torch.Tensor:
+        scene, _ = fit(clip, both_hands, plan)
+        position = scene.hand_poses["right"].position
+        return position.base_log_depth + position.log_depth
+
+    slow, usual = depths(replace(tiny, fps=10.0)), depths(tiny)
+    assert torch.equal(depths(replace(tiny, pace=10.0)), slow) and not torch.equal(slow, usual)
 
 
 def test_a_network_for_the_perceptual_term(

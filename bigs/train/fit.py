@@ -118,7 +118,7 @@ def fit(
         FloatingPointError: a loss became infinite or not a number.
     """
     report = FitReport()
-    config = at_rate(config, clip.fps)
+    config = at_rate(config, clip.fps if clip.pace is None else clip.pace)
     _check_networks(config, perceptual, denoiser)
     torch.manual_seed(config.seed)
     watch = watch or Stopwatch("start values")

@@ -9,6 +9,7 @@ from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.exposure import with_one_exposure
 from bigs.data.formats.layouts import load_clip
+from bigs.data.pace import with_pace
 from bigs.data.plausible import plausible
 from bigs.data.swapped_labels import with_labels_sorted
 from bigs.hand import HandModel
@@ -28,7 +29,7 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
     if clip.annotated:
         return clip
     clip = with_labels_sorted(clip, initial_trajectory(clip, hand_models).joints)
-    return with_one_exposure(clip)
+    return with_pace(with_one_exposure(clip))
 
 
 def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:

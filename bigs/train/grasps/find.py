@@ -31,6 +31,9 @@ from bigs.types import Side
 _JOINTS = (0, 1, 4, 7, 10, 13, 16, 17, 18, 19, 20)
 # However wrong its depth is, a hand that holds the object is within this distance of its surface, metres.
 _ARM = 0.3
+# An object at rest would move a hand that it carries by no more than this, in metres, within a quarter of a
+# second: tracks err by less, and nobody holds as still.
+_AT_REST = 0.003
 # Pictures say more than estimates, so in the second cut half of a frame's price comes from the masks.
 _ESTIMATE_SHARE = 0.5
 
@@ -61,7 +64,8 @@ def find_grasps(
     """Find the grasps of every hand in the scene as it is, and let the object carry the hand through them.
 
     The estimates propose grasps. Each is then carried with the object to all frames, and what the masks say
-    there decides which frames it has: grasps grow, shrink, replace one another, or vanish.
+    there decides which frames it has: grasps grow, shrink, replace one another, or vanish. Where the object
+    hardly moves, a hand that rests beside it shows the same as one that holds it, and counts as free.
 
     All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
     estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an
@@ -114,7 +118,9 @@ def _search(
 ) -> FoundGrasps:
     at = scene.at(torch.arange(scene.n_frames))
     poses, carrier = at.hand(side), at.object
-    points, information = _in_object_frame(scene, side, stage)
+    joints = at.joints(side)[:, list(_JOINTS)]
+    points, information = _in_frame_of(carrier, joints, stage)
+    world = _resting(carrier)
     touches = touching.numpy()
     reach = float(carrier.scale * scene.object_surface.verts.norm(dim=1).max()) + _ARM
 
@@ -135,16 +141,21 @@ def _search(
         # The usual disagreement of a hand in its own pose; frames with wrong estimates have more.
         usual = float(mismatch(side, poses, torch.arange(scene.n_frames)).nanquantile(0.25))
         apart = prices.free * ~touches
+
+        def judged(frame: ObjectFrames, hypotheses: list[range]) -> tuple[np.ndarray, np.ndarray]:
+            """What each frame pays for a hand that `frame` carries, by pictures and in all: [H, T]."""
+            pictures = [_excess(mismatch, side, poses, frame, h, usual) for h in hypotheses]
+            by_estimate = _estimate_costs(*_in_frame_of(frame, joints, stage), hypotheses)
+            by_picture = prices.free / stage.excess * np.reshape(pictures, by_estimate.shape)
+            return by_picture, by_picture + _ESTIMATE_SHARE * np.minimum(by_estimate, prices.free)
+
         for _ in range(stage.rounds):
             hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, prices))
-            pictures = np.stack(
-                [_excess(mismatch, side, poses, carrier, h, usual) for h in hypotheses]
-                or [np.zeros((0, scene.n_frames))]
-            ).reshape(len(hypotheses), scene.n_frames)
-            by_estimate = _estimate_costs(points, information, hypotheses)
-            pictures = prices.free * pictures / stage.excess
-            costs = np.maximum(pictures + _ESTIMATE_SHARE * np.minimum(by_estimate, prices.free), apart)
-            again = joined(grasps_by_frames(costs, prices), np.maximum(pictures, apart), prices)
+            pictures, costs = judged(carrier, hypotheses)
+            pictures, costs = np.maximum(pictures, apart), np.maximum(costs, apart)
+            still = [h for h in hypotheses if _rests(carrier, joints, h, 2 * prices.least)]
+            _, resting = judged(world, still)
+            again = joined(grasps_by_frames(costs, prices, resting), pictures, prices)
             settled = [s.frames for s in again] == [s.frames for s in stretches]
             stretches = again
             if settled:
@@ -200,11 +211,33 @@ def _excess(
     return torch.nan_to_num(carried - usual, nan=0.0).double().numpy()
 
 
-def _in_object_frame(scene: Scene, side: Side, stage: GraspStage) -> tuple[np.ndarray, np.ndarray]:
-    """Joints [T, K, 3] of a hand in the object's frame, metres, and the information [T, 3, 3] of each."""
-    at = scene.at(torch.arange(scene.n_frames))
-    joints, carrier = at.joints(side), at.object
-    points = carrier.scale * at.in_object_frame(joints)[:, list(_JOINTS)]
+def _resting(carrier: ObjectFrames) -> ObjectFrames:
+    """Poses of an object that does not move."""
+    return carrier._replace(
+        rotations=torch.eye(3).expand_as(carrier.rotations), centers=torch.zeros_like(carrier.centers)
+    )
+
+
+def _rests(carrier: ObjectFrames, joints: Tensor, frames: range, least: int) -> bool:
+    """Whether an object that carries a hand through some frames would hardly move its joints [T, K, 3].
+
+    Args:
+        carrier: the object.
+        joints: of the hand.
+        frames: consecutive ones.
+        least: fewer frames are judged with those around them, so many in all.
+    """
+    middle = frames[len(frames) // 2]
+    start = max(min(frames.start, middle - least // 2, len(joints) - least), 0)
+    frames = range(start, max(frames.stop, min(start + least, len(joints))))
+    held = (joints[middle] - carrier.centers[middle]) @ carrier.rotations[middle]
+    carried = held @ carrier.rotations[frames].transpose(-1, -2) + carrier.centers[frames, None]
+    return bool((carried - joints[middle]).norm(dim=-1).mean(-1).max() < _AT_REST)
+
+
+def _in_frame_of(carrier: ObjectFrames, joints: Tensor, stage: GraspStage) -> tuple[np.ndarray, np.ndarray]:
+    """Joints [T, K, 3], the wrist first, as the carrier sees them, metres, and the information [T, 3, 3]."""
+    points = (joints - carrier.centers[:, None]) @ carrier.rotations
     wrist = joints[:, 0].double()
     ray = torch.nn.functional.normalize(wrist, dim=-1)
     ray = (carrier.rotations.double().transpose(-1, -2) @ ray[..., None])[..., 0]

@@ -40,6 +40,11 @@ class Prices(NamedTuple):
     gap: int  # fewest frames between two grasps: nobody lets go and grasps again in less
 
     @property
+    def rest(self) -> float:
+        """Price of a hand that rests, likewise: what a still hand and a still object show proves no grasp."""
+        return 0.5 * self.grasp
+
+    @property
     def least_at_border(self) -> int:
         """Fewest frames of a grasp that goes on beyond the clip: more than half of one."""
         return self.least // 2 + 1
@@ -116,23 +121,28 @@ def grasps_by_estimates(
     trust = np.where(stray_frames(points, information), 1e-3, 1.0)
     costs = still_costs(points, trust[:, None, None] * information)
     fixed = np.concatenate([[0.0], np.cumsum(prices.free * np.maximum(trust < 1.0, ~touching))])
-    return [frames for frames, _ in _cheapest((costs + fixed - fixed[:-1, None])[None], prices)]
+    costs = (costs + fixed - fixed[:-1, None])[None]
+    return [frames for frames, _ in _cheapest(costs, prices, np.array([prices.grasp]))]
 
 
-def grasps_by_frames(costs: np.ndarray, prices: Prices) -> list[Stretch]:
+def grasps_by_frames(costs: np.ndarray, prices: Prices, resting: np.ndarray | None = None) -> list[Stretch]:
     """Cut a clip into grasps, each of which follows one of H hypotheses.
 
     Args:
         costs: [H, T] what each frame pays under each hypothesis; limited to a few times `prices.free`.
         prices: in the same unit.
+        resting: [R, T] the same for hands that rest, whatever the object does. Frames that one of them
+            explains better are in no grasp.
     """
     if len(costs) == 0:
         return []
-    limited = np.minimum(costs, _MOST * prices.free)
-    sums = np.concatenate([np.zeros((len(costs), 1)), np.cumsum(limited, axis=1)], axis=1)
+    every = costs if resting is None else np.concatenate([costs, resting])
+    limited = np.minimum(every, _MOST * prices.free)
+    sums = np.concatenate([np.zeros((len(every), 1)), np.cumsum(limited, axis=1)], axis=1)
     stretches = sums[:, None, :] - sums[:, :-1, None]
+    each = np.where(np.arange(len(every)) < len(costs), prices.grasp, prices.rest)
     # The frames at a grasp's ends must be cheaper inside than outside.
-    return _cheapest(stretches, prices)
+    return [found for found in _cheapest(stretches, prices, each) if found.hypothesis < len(costs)]
 
 
 def joined(stretches: list[Stretch], pictures: np.ndarray, prices: Prices) -> list[Stretch]:
@@ -164,10 +174,16 @@ def joined(stretches: list[Stretch], pictures: np.ndarray, prices: Prices) -> li
     return found
 
 
-def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
-    """The cheapest cut, given what every stretch costs under every hypothesis: [H, T, T + 1]."""
+def _cheapest(costs: np.ndarray, prices: Prices, each: np.ndarray) -> list[Stretch]:
+    """The cheapest cut, given what every stretch costs under every hypothesis: [H, T, T + 1].
+
+    Args:
+        costs: without the price of a stretch.
+        prices: the other prices.
+        each: [H] the price of a stretch under each hypothesis, half of it for each of its ends.
+    """
     count = costs.shape[1]
-    costs = _priced(costs, prices)
+    costs = _priced(costs, prices, each)
     which = costs.argmin(axis=0)
     cost = np.take_along_axis(costs, which[None], axis=0)[0]
     # The cheapest cut of the first t frames that may begin a grasp next, and the cheapest that ends in one.
@@ -198,8 +214,8 @@ def _cheapest(costs: np.ndarray, prices: Prices) -> list[Stretch]:
     return found[::-1]
 
 
-def _priced(costs: np.ndarray, prices: Prices) -> np.ndarray:
-    """What every stretch costs as a grasp, with its ends; infinite where it is too short: [H, T, T + 1].
+def _priced(costs: np.ndarray, prices: Prices, each: np.ndarray) -> np.ndarray:
+    """What every stretch costs with its ends; infinite where it is too short: [H, T, T + 1].
 
     The clip's border is no end where the frame there agrees. One that hardly does is no reason to believe
     that the grasp goes on.
@@ -207,9 +223,9 @@ def _priced(costs: np.ndarray, prices: Prices) -> np.ndarray:
     count = costs.shape[1]
     sure = _SURE * prices.free
     came, goes = costs[:, 0, 1] <= sure, costs[:, -1, -1] <= sure
-    costs = costs + prices.grasp
-    costs[came, 0] -= 0.5 * prices.grasp
-    costs[goes, :, -1] -= 0.5 * prices.grasp
+    costs = costs + each[:, None, None]
+    costs[came, 0] -= 0.5 * each[came, None]
+    costs[goes, :, -1] -= 0.5 * each[goes, None]
     lengths = np.arange(count + 1)[None] - np.arange(count)[:, None]
     allowed = np.tile(lengths >= prices.least, (len(costs), 1, 1))
     allowed[came, 0] = lengths[0] >= prices.least_at_border

@@ -66,19 +66,21 @@ def own_ends(row: np.ndarray, start: int, stop: int, free: float) -> int:
     )
 
 
-def price_of(row: np.ndarray, start: int, stop: int, prices: Prices) -> float:
-    """Of a grasp, infinite where it is too short."""
+def price_of(row: np.ndarray, start: int, stop: int, prices: Prices, each: float | None = None) -> float:
+    """Of a stretch, a grasp or of the price `each`; infinite where it is too short."""
     ends = own_ends(row, start, stop, prices.free)
     reaches = (start == 0 and row[0] <= 0.5 * prices.free) or (
         stop == len(row) and row[-1] <= 0.5 * prices.free
     )
     least = prices.least_at_border if reaches else prices.least
-    return row[start:stop].sum() + 0.5 * prices.grasp * ends if stop - start >= least else np.inf
+    each = prices.grasp if each is None else each
+    return row[start:stop].sum() + 0.5 * each * ends if stop - start >= least else np.inf
 
 
-def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
+def cheapest_of_all(costs: np.ndarray, prices: Prices, resting: np.ndarray | None = None) -> float:
     """The least price of any cut, by trying every one."""
     count = costs.shape[1]
+    rests = np.empty((0, count)) if resting is None else resting
     best = prices.free * count
     edges = range(count + 1)
     for grasps in range(1, 4):
@@ -87,7 +89,10 @@ def cheapest_of_all(costs: np.ndarray, prices: Prices) -> float:
             near = any(after[0] - before[1] < prices.gap for before, after in pairwise(pairs))
             if near:
                 continue
-            inside = sum(min(price_of(row, a, b, prices) for row in costs) for a, b in pairs)
+            inside = 0.0
+            for a, b in pairs:
+                held = [price_of(row, a, b, prices) for row in costs]
+                inside += min(held + [price_of(row, a, b, prices, 0.5 * prices.grasp) for row in rests])
             held = sum(b - a for a, b in pairs)
             best = min(best, inside + prices.free * (count - held))
     return best
@@ -104,6 +109,44 @@ def test_no_cut_is_cheaper(seed: int) -> None:
     paid = sum(price_of(limited[h], s.start, s.stop, prices) for s, h in found) + 13 - held
     assert paid == pytest.approx(cheapest_of_all(limited, prices))
     assert all(b.frames.start - a.frames.stop >= 2 for a, b in pairwise(found))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_cut_with_hands_that_rest_is_cheaper(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    costs, resting = rng.gamma(0.7, 1.5, (2, 2, 13))
+    # One grasp fits perfectly, so that it is found beside what rests.
+    costs[0, :5] = 0.0
+    prices = Prices(free=1.0, grasp=0.4, least=4, gap=2)
+    least = cheapest_of_all(np.minimum(costs, 2.5), prices, np.minimum(resting, 2.5))
+    found = grasps_by_frames(costs, prices, resting)
+    # The grasps as found, and whatever else is cheapest beside them, cost no more than the best cut.
+    held = np.minimum(costs, 2.5)
+    only = np.full_like(held, 100.0)
+    for frames, hypothesis in found:
+        only[hypothesis, frames] = held[hypothesis, frames]
+    assert cheapest_of_all(only, prices, np.minimum(resting, 2.5)) == pytest.approx(least)
+    assert found and found[0].frames.start == 0
+
+
+def test_a_hand_that_rests_beside_an_object_at_rest_holds_nothing() -> None:
+    costs = np.full((2, 40), 9.0)
+    costs[0, :12], costs[1, 20:] = 0.1, 0.1
+    resting = np.full((1, 40), 9.0)
+    assert [s.frames for s in grasps_by_frames(costs, PRICES, resting)] == [range(0, 12), range(20, 40)]
+    resting[0, :12] = 0.1
+    assert grasps_by_frames(costs, PRICES, resting) == [(range(20, 40), 1)]
+
+
+def test_a_rest_within_a_grasp_is_a_part_of_it() -> None:
+    costs, resting = np.full((1, 40), 0.3), np.full((1, 40), 9.0)
+    resting[0, 10:30] = 0.1
+    assert grasps_by_frames(costs, PRICES, resting) == [(range(0, 40), 0)]
+
+
+def test_a_clip_in_which_nothing_moves_is_one_grasp() -> None:
+    still = np.full((1, 40), 0.3)
+    assert grasps_by_frames(still, PRICES, still) == [(range(0, 40), 0)]
 
 
 def test_grasps_are_found_where_the_hand_stands_still() -> None:

@@ -13,10 +13,16 @@ from toy_scenes import cube_scene
 from bigs.checks import InputError
 from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, rotation_angle
 from bigs.hand import builtin_hand, mirror_rotation
-from bigs.models.poses import HandFrames
+from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
-from bigs.train.grasps.find import carried_errors, expected_depths, find_grasps, turned_between
+from bigs.train.grasps.find import (
+    _rests,
+    carried_errors,
+    expected_depths,
+    find_grasps,
+    turned_between,
+)
 from bigs.train.loop.pose_terms import depth_prior
 from bigs.train.loop.step import Selection, Step
 from bigs.train.plan.config import GraspStage, RunConfig
@@ -161,6 +167,77 @@ def test_pictures_drop_a_grasp_that_they_contradict() -> None:
 
     found = find_grasps(scene, STAGE, touching, mismatch)
     assert found["left"].stretches == [] and found["right"].stretches == [range(0, FRAMES)]
+
+
+def waiting_scene(aside: float, drift: float = 0.0) -> Scene:
+    """The object rests for ten frames and turns afterwards. The right hand is `aside` metres away from where
+    it holds on, comes nearer in frames 9 to 14, and holds on from then on.
+
+    Args:
+        drift: metres by which the object moves in each of the first ten frames, and hands with it.
+    """
+    scene = turning_scene()
+    at = scene.at(ALL)
+    with torch.no_grad():
+        held = {side: at.in_object_frame(at.hand(side).wrist[:, None])[:1] for side in scene.sides}
+        turn = 0.15 * (ALL - 9.0).clamp_min(0.0)
+        rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
+        scene.object_poses.base_orient.copy_(rotations)
+        moved = torch.tensor([0.0, drift, 0.0]) * ALL.clamp(max=9)[:, None]
+        scene.object_poses.position.restart(at.object.centers + moved)
+        at = scene.at(ALL)
+        away = aside * (1.0 - (ALL - 8.0) / 6.0).clamp(0.0, 1.0)
+        for side in scene.sides:
+            wrist = (rotations @ (at.object.scale * held[side][0, 0])[:, None])[..., 0] + at.object.centers
+            wrist = wrist + (away if side == "right" else 0.0 * away)[:, None] * torch.tensor([0.0, 1.0, 0.0])
+            poses = scene.hand_poses[side]
+            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
+            poses.position.restart(wrist)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("aside", "drift", "held"),
+    [
+        (0.03, 0.0, [range(15, FRAMES)]),  # both rest: nothing says that it holds on
+        (0.03, 0.002, [range(0, 9), range(14, FRAMES)]),  # it moves with the object: a grasp elsewhere
+        (0.0, 0.0, [range(0, FRAMES)]),  # it rests where it holds the object afterwards
+    ],
+)
+def test_a_still_hand_on_a_still_object_proves_no_grasp(
+    aside: float, drift: float, held: list[range]
+) -> None:
+    scene, truth = waiting_scene(aside, drift), waiting_scene(aside, drift)
+
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
+        return (poses.wrist - truth.at(ALL).hand(side).wrist).norm(dim=-1) / 0.01
+
+    found = find_grasps(scene, STAGE, EVERYWHERE, mismatch)["right"].stretches
+    assert len(found) == len(held)
+    for a, b in zip(found, held, strict=True):
+        assert abs(a.start - b.start) <= 1 and abs(a.stop - b.stop) <= 1
+
+
+@pytest.mark.parametrize(
+    ("frames", "drift", "rests"),
+    [
+        (range(2, 10), 0.0002, True),  # as tracks err
+        (range(2, 10), 0.001, False),  # as slow as anybody moves what they hold
+        (range(0, 3), 0.001, False),  # too few to tell are judged with those beside them
+        (range(FRAMES - 3, FRAMES), 0.001, False),
+        (range(0, FRAMES), 0.0002, True),
+    ],
+)
+def test_an_object_rests_that_moves_no_more_than_tracks_err(frames: range, drift: float, rests: bool) -> None:
+    centers = drift * ALL[:, None] * torch.tensor([0.6, 0.0, 0.8])
+    carrier = ObjectFrames(torch.eye(3).expand(FRAMES, 3, 3), centers, torch.tensor(1.0))
+    joints = torch.tensor([0.1, 0.0, 0.5]).expand(FRAMES, 11, 3)
+    assert _rests(carrier, joints, frames, 8) == rests
+    turn = torch.stack([0 * ALL, drift / 0.1 * ALL, 0 * ALL], -1)
+    turning = ObjectFrames(
+        axis_angle_to_matrix(turn), torch.tensor([0.0, 0.0, 0.5]).expand(FRAMES, 3), torch.tensor(1.0)
+    )
+    assert _rests(turning, joints, frames, 8) == rests
 
 
 def test_a_hand_metres_away_holds_nothing() -> None:
