@@ -120,7 +120,7 @@ def _search(
     poses, carrier = at.hand(side), at.object
     joints = at.joints(side)[:, list(_JOINTS)]
     points, information = _in_frame_of(carrier, joints, stage)
-    world = _resting(carrier)
+    world, at_rest = _resting(carrier), _at_rest(carrier, joints, 2 * stage.least)
     touches = touching.numpy()
     reach = float(carrier.scale * scene.object_surface.verts.norm(dim=1).max()) + _ARM
 
@@ -153,8 +153,7 @@ def _search(
             hypotheses = reached(_hypotheses([s.frames for s in stretches], scene.n_frames, prices))
             pictures, costs = judged(carrier, hypotheses)
             pictures, costs = np.maximum(pictures, apart), np.maximum(costs, apart)
-            still = [h for h in hypotheses if _rests(carrier, joints, h, 2 * prices.least)]
-            _, resting = judged(world, still)
+            _, resting = judged(world, _parts(hypotheses, at_rest, prices.least_at_border))
             again = joined(grasps_by_frames(costs, prices, resting), pictures, prices)
             settled = [s.frames for s in again] == [s.frames for s in stretches]
             stretches = again
@@ -218,21 +217,33 @@ def _resting(carrier: ObjectFrames) -> ObjectFrames:
     )
 
 
-def _rests(carrier: ObjectFrames, joints: Tensor, frames: range, least: int) -> bool:
-    """Whether an object that carries a hand through some frames would hardly move its joints [T, K, 3].
+def _at_rest(carrier: ObjectFrames, joints: Tensor, least: int) -> np.ndarray:
+    """Frames [T] (bool) among so many, `least` or more, in which the object hardly moves what it carries.
 
     Args:
         carrier: the object.
-        joints: of the hand.
-        frames: consecutive ones.
-        least: fewer frames are judged with those around them, so many in all.
+        joints: [T, K, 3] of a hand.
+        least: fewer frames do not tell.
     """
-    middle = frames[len(frames) // 2]
-    start = max(min(frames.start, middle - least // 2, len(joints) - least), 0)
-    frames = range(start, max(frames.stop, min(start + least, len(joints))))
-    held = (joints[middle] - carrier.centers[middle]) @ carrier.rotations[middle]
-    carried = held @ carrier.rotations[frames].transpose(-1, -2) + carrier.centers[frames, None]
-    return bool((carried - joints[middle]).norm(dim=-1).mean(-1).max() < _AT_REST)
+    still = np.zeros(len(joints), dtype=bool)
+    for start in range(max(len(joints) - least, 0) + 1):
+        window = slice(start, start + least)
+        middle = min(start + least // 2, len(joints) - 1)
+        held = (joints[middle] - carrier.centers[middle]) @ carrier.rotations[middle]
+        carried = held @ carrier.rotations[window].transpose(-1, -2) + carrier.centers[window, None]
+        still[window] |= bool((carried - joints[middle]).norm(dim=-1).mean(-1).max() < _AT_REST)
+    return still
+
+
+def _parts(stretches: list[range], chosen: np.ndarray, least: int) -> list[range]:
+    """The different runs of `least` or more chosen frames (of [T] bool) within stretches."""
+    found = {}
+    for stretch in stretches:
+        edges = np.flatnonzero(np.diff(chosen[stretch.start : stretch.stop], prepend=False, append=False))
+        for start, stop in (edges.reshape(-1, 2) + stretch.start).tolist():
+            if stop - start >= least:
+                found[range(start, stop)] = None
+    return list(found)
 
 
 def _in_frame_of(carrier: ObjectFrames, joints: Tensor, stage: GraspStage) -> tuple[np.ndarray, np.ndarray]:
