@@ -113,6 +113,10 @@ class HandModel(nn.Module):
         # A model may skin a finger without its outermost joint.
         return tuple(tip for tip in tips if tip)
 
+    def faces_of(self, side: Side) -> Tensor:
+        """Faces [F, 3] that look outwards on this hand as that side shows it: a mirror turns them around."""
+        return self.faces if side == self.side else self.faces.flip(-1)
+
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Vertices [..., V, 3] of the shape `betas` [..., 10] in the rest pose, metres."""
         check_shape("betas", betas, ("...", self.shapedirs.shape[-1]))

@@ -48,8 +48,7 @@ def measure_occlusion(scene: Scene) -> None:
 
 def _hand(scene: Scene, side: Side, verts: Tensor) -> Discs:
     """A hand's vertices [T, V, 3] as discs, each with a third of the triangles around it."""
-    model = scene.hand_model(side)
-    faces = model.faces if side == "right" else model.faces.flip(-1)
+    faces = scene.hand_model(side).faces_of(side)
     a, b, c = verts[:, faces].unbind(2)
     across = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(verts)

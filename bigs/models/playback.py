@@ -247,7 +247,7 @@ def record(
         hands[side] = HandPlayback(
             joints,
             verts,
-            model.faces if side == "right" else model.faces.flip(-1),
+            model.faces_of(side),
             model(betas, pose.hand_pose, pose.global_orient, pose.wrist).bone_transforms,
             pose.hand_pose,
             splats._replace(

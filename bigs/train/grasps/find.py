@@ -237,7 +237,7 @@ def _at_rest(carrier: ObjectFrames, joints: Tensor, least: int) -> np.ndarray:
 
 def _parts(stretches: list[range], chosen: np.ndarray, least: int) -> list[range]:
     """The different runs of `least` or more chosen frames (of [T] bool) within stretches."""
-    found = {}
+    found: dict[range, None] = {}
     for stretch in stretches:
         edges = np.flatnonzero(np.diff(chosen[stretch.start : stretch.stop], prepend=False, append=False))
         for start, stop in (edges.reshape(-1, 2) + stretch.start).tolist():

@@ -252,6 +252,9 @@ class OpeningConfig:
     area: float = 1e-4
     # Surface nearer than this to a measured point is there, metres.
     measured: float = 0.004
+    # Surface that lies deeper than this in a hand that holds the object for as many frames is not there,
+    # metres: hands that were drawn to the surface are off by less.
+    inside: float = 0.003
 
 
 Stage = (

@@ -1,4 +1,7 @@
-"""Openings: a closed surface has a lid where the object has none, and what is behind it is seen there."""
+"""Openings: a closed surface has a lid where the object has none, and what is behind it is seen there.
+
+It also fills the grip of a hand that never lets go, where the hand itself is.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ def openings(
 
     Where a hand that the masks show or a point that a frame measured lies behind surface, that surface cannot
     be there. The opening goes on from there as far as nothing was measured and brightness varies over time as
-    it does where a picture was painted on the wrong place.
+    it does where a picture was painted on the wrong place. Nor can surface be where a hand is that holds it.
 
     Args:
         scene: has an object; its poses are final.
@@ -52,24 +55,23 @@ def openings(
     """
     verts, faces = surface.verts.double().numpy(), surface.faces.numpy()
     views = object_views(scene, evidence)
+    area = _vertex_areas(verts, faces)
     unmeasured = scipy.spatial.cKDTree(measured.points).query(verts)[0] > config.measured
+    gripped = unmeasured & _in_grips(scene, verts, config)
+    gripped &= _with_proof(faces, gripped, area * gripped, config.area)
     least, least_points = (
         max(config.frames, share * scene.n_frames) for share in (config.share, config.points_share)
     )
     proven = _hands_behind(scene, evidence, views, verts, config.depth) >= least
     proven |= _points_behind(views, verts, measured, config.depth) >= least_points
     proven &= unmeasured
-    area = _vertex_areas(verts, faces)
     if area[proven].sum() < config.area:
-        return np.zeros(len(verts), dtype=bool)
+        return gripped
     varies = _variation(scene, evidence, views, verts, faces)
     usual = np.nanmedian(varies[~unmeasured]) if np.isfinite(varies[~unmeasured]).any() else np.inf
     # Comparisons with what is not known are false.
     open_ = proven | (unmeasured & (varies > usual))
-    patches = _patches(faces, open_)
-    proof = np.bincount(patches, np.where(proven, area, 0.0)[open_])
-    open_[open_] = (proof >= config.area)[patches]
-    return open_
+    return gripped | _with_proof(faces, open_, area * proven, config.area)
 
 
 def without_openings(surface: ObjectSurface, open_: np.ndarray) -> ObjectSurface:
@@ -112,6 +114,28 @@ def _points_behind(
         here = ObjectViews(everywhere, views.K, views.rotations[one], views.centers[one])
         count += times_empty(here.shown, here.poses, verts, measured.points[index[frame == t]], depth)
     return count
+
+
+def _in_grips(scene: Scene, verts: np.ndarray, config: OpeningConfig) -> np.ndarray:
+    """Which vertices [V] (bool) lie inside a hand that holds the object for as many frames as count."""
+    inside = np.zeros(len(verts), dtype=bool)
+    posed = scene.at(torch.arange(scene.n_frames))
+    for side in scene.sides:
+        grasps, model = scene.grasps[side], scene.hand_model(side)
+        faces = model.faces_of(side).numpy()
+        follow = _places(faces, len(model.v_template))
+        with torch.no_grad():
+            hands = posed.in_object_frame(posed.verts(side))
+        for grasp in range(grasps.count):
+            held = grasps.of_frame == grasp
+            if held.sum() < config.frames:
+                continue
+            hand = hands[held].median(0).values.double().numpy()
+            normals = follow @ vertex_normals(hand, faces)
+            places = follow @ hand
+            nearest = scipy.spatial.cKDTree(places).query(verts)[1]
+            inside |= ((places[nearest] - verts) * normals[nearest]).sum(-1) > config.inside
+    return inside
 
 
 def _places(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
@@ -170,11 +194,14 @@ def _vertex_areas(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.bincount(faces.ravel(), np.repeat(face_areas(verts, faces) / 3.0, 3), minlength=len(verts))
 
 
-def _patches(faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The number of the connected patch of each of the chosen vertices."""
+def _with_proof(faces: np.ndarray, chosen: np.ndarray, proof: np.ndarray, least: float) -> np.ndarray:
+    """Those of the chosen vertices [V] (bool) whose connected patch has enough proof [V] in all."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     index = np.cumsum(chosen) - 1
     edges = index[edges[chosen[edges].all(axis=1)]]
     count = int(chosen.sum())
     graph = scipy.sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    patches = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    kept = chosen.copy()
+    kept[chosen] = (np.bincount(patches, proof[chosen]) >= least)[patches]
+    return kept

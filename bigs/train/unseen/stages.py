@@ -99,7 +99,7 @@ def finish_mesh(
         if found.any():
             learned = without_openings(learned, found)
             facts["object openings"] = (
-                f"{found.mean():.0%} of the mesh, where hands or points are seen through it"
+                f"{found.mean():.0%} of the mesh, where hands are or hands or points are seen through it"
             )
     scene.replace_surface(learned)
     return facts

@@ -18,7 +18,7 @@ from bigs.train.loop.step import Evidence
 from bigs.train.loop.targets import Targets
 from bigs.train.plan.config import OpeningConfig
 from bigs.train.unseen.openings import openings, without_openings
-from bigs.types import Side
+from bigs.types import SIDES, Side
 
 FRAMES = 8
 # A plate this far before the hands, in the object's frame, and so wide.
@@ -121,6 +121,71 @@ def test_a_hand_that_the_masks_do_not_show_proves_nothing(scene: Scene) -> None:
     clip = evidence(scene, flicker=0.8)
     clip.targets.shares["right"].zero_()
     assert not openings(scene, scene.object_surface, clip, cube_points(scene), OpeningConfig()).any()
+
+
+def hold(scene: Scene, side: Side, frames: int = FRAMES) -> None:
+    """A hand holds the object in the first frames."""
+    poses = scene.at(torch.arange(FRAMES))
+    held = torch.where(torch.arange(FRAMES) < frames, 0, -1)
+    scene.grasps[side].set(held, 0.0, poses.hand(side), poses.object)
+
+
+def plate_through_hand(scene: Scene, side: Side) -> np.ndarray:
+    """Add a plate to the surface that cuts a hand; returns how deep in it each vertex [V] lies."""
+    hand = scene.at(torch.arange(1)).verts(side)[0].detach().double().numpy() - CENTER
+    low, high = hand.min(0) - 0.03, hand.max(0) + 0.03
+    x, z = (a.ravel() for a in np.meshgrid(*(np.linspace(low[i], high[i], 61) for i in (0, 2))))
+    plate = np.column_stack([x, np.full(len(x), hand[:, 1].mean()), z])
+    corner = (61 * np.arange(60)[:, None] + np.arange(60)).ravel()[:, None]
+    faces = np.concatenate([corner + np.array(turn) for turn in ((0, 61, 1), (1, 61, 62))])
+    old = scene.object_surface
+    verts = np.concatenate([old.verts.numpy(), plate])
+    scene.replace_surface(
+        ObjectSurface(
+            torch.as_tensor(verts, dtype=torch.float32),
+            torch.cat([old.faces, torch.as_tensor(faces + len(old.verts))]),
+        )
+    )
+    mesh = trimesh.Trimesh(hand, scene.hand_model("right").faces.numpy(), process=False)
+    trimesh.repair.fill_holes(mesh)
+    deep = np.full(len(verts), -1.0)
+    away = trimesh.proximity.closest_point(mesh, plate)[1]
+    deep[len(old.verts) :] = np.where(np.abs(winding(mesh.triangles, plate)) > 0.5, away, -away)
+    return deep
+
+
+def winding(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How often closed triangles [F, 3, 3] wind around points [N]: their solid angles by 4 pi (Van Oosterom
+    and Strackee 1983)."""
+    total = np.zeros(len(points))
+    for triangle in triangles:
+        a, b, c = (corner - points for corner in triangle)
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        dots = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+        total += 2.0 * np.arctan2((a * np.cross(b, c)).sum(1), dots)
+    return total / (4.0 * np.pi)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_no_surface_lies_in_a_hand_that_holds_the_object(scene: Scene, side: Side) -> None:
+    clip, measured = evidence(scene, flicker=0.0), cube_points(scene)
+    shown = evidence(scene, flicker=0.0)
+    deep = plate_through_hand(scene, side)
+    clip.targets.shares["right"].zero_()  # nothing is seen through the surface
+    assert not openings(scene, scene.object_surface, clip, measured, OpeningConfig()).any(), "not held"
+    hold(scene, side)
+    found = openings(scene, scene.object_surface, clip, measured, OpeningConfig())
+    assert (deep > 0.005).sum() > 50 and found[deep > 0.005].mean() > 0.95
+    assert not found[deep < 0.001].any()
+    # Not where a point was measured, nor for too small a part, a shallow one or a short grasp.
+    beside = measured._replace(points=np.concatenate([measured.points, scene.object_surface.verts[found]]))
+    assert not openings(scene, scene.object_surface, clip, beside, OpeningConfig()).any()
+    for strict in ({"area": 1.0}, {"inside": 0.1}, {"frames": FRAMES + 1}):
+        assert not openings(scene, scene.object_surface, clip, measured, OpeningConfig(**strict)).any()
+    seen = openings(scene, scene.object_surface, shown, measured, OpeningConfig())
+    assert seen[found].all() and seen[on_plate(scene)].any(), "beside what is seen through"
+    hold(scene, side, OpeningConfig().frames - 1)
+    assert not openings(scene, scene.object_surface, clip, measured, OpeningConfig()).any()
 
 
 def test_surface_before_points_that_were_measured_through_it_is_open(scene: Scene) -> None:
