@@ -48,8 +48,8 @@ def with_pace(clip: Clip) -> Clip:
     if slowest >= _BELIEVED * clip.fps:
         return clip
     note = (
-        f"frames a second: {clip.fps:.3g}, yet hands and object move from frame to frame as they do at "
-        f"{slowest:.0f}; the plan allows for it (bigs convert --fps states a clip's rate)"
+        f"frames a second: {clip.fps:.3g}, yet hands and object move from frame to frame as they usually do "
+        f"at {slowest:.0f}; the plan allows for it (bigs convert --fps states a clip's rate)"
     )
     return replace(clip, pace=float(slowest), notes=(*clip.notes, note))
 

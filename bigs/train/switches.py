@@ -219,7 +219,7 @@ _INGREDIENTS = {
         _no_prior,
     ),
     "openings": Switch(
-        "openings of the object's mesh, through which hands or points are seen",
+        "openings of the object's mesh, where hands are or hands or points are seen through it",
         lambda config: replace(config, openings=None),
     ),
     "smooth": Switch(
