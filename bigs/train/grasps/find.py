@@ -220,6 +220,8 @@ def _resting(carrier: ObjectFrames) -> ObjectFrames:
 def _at_rest(carrier: ObjectFrames, joints: Tensor, least: int) -> np.ndarray:
     """Frames [T] (bool) among so many, `least` or more, in which the object hardly moves what it carries.
 
+    None if it never does: of an object that nobody moves, touch alone tells who holds it.
+
     Args:
         carrier: the object.
         joints: [T, K, 3] of a hand.
@@ -232,7 +234,7 @@ def _at_rest(carrier: ObjectFrames, joints: Tensor, least: int) -> np.ndarray:
         held = (joints[middle] - carrier.centers[middle]) @ carrier.rotations[middle]
         carried = held @ carrier.rotations[window].transpose(-1, -2) + carrier.centers[window, None]
         still[window] |= bool((carried - joints[middle]).norm(dim=-1).mean(-1).max() < _AT_REST)
-    return still
+    return still & ~still.all()
 
 
 def _parts(stretches: list[range], chosen: np.ndarray, least: int) -> list[range]:

@@ -246,6 +246,24 @@ def test_an_object_rests_that_moves_no_more_than_tracks_err(drift: float, rests:
     assert still.tolist() == [rests and t >= 5 for t in range(FRAMES)]
 
 
+def test_an_object_that_never_moves_is_held_by_who_touches_it() -> None:
+    scene = waiting_scene(0.0)
+    with torch.no_grad():
+        still = scene.at(ALL).object
+        scene.object_poses.base_orient.copy_(still.rotations[:1].expand(FRAMES, 3, 3))
+        for side in scene.sides:
+            wrist = scene.at(ALL).hand(side).wrist[:1].expand(FRAMES, 3)
+            scene.hand_poses[side].base_orient.copy_(torch.eye(3).expand(FRAMES, 3, 3))
+            scene.hand_poses[side].position.restart(wrist.clone())
+    touching = {side: (ALL < 20).float() for side in scene.sides}
+
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
+        return torch.full((FRAMES,), 0.02)
+
+    found = find_grasps(scene, STAGE, touching, mismatch)
+    assert [found[side].stretches for side in scene.sides] == [[range(0, 20)], [range(0, 20)]]
+
+
 def test_parts_of_stretches_that_are_chosen() -> None:
     chosen = np.array([1, 1, 1, 0, 1, 1, 0, 0, 1, 1, 1, 1], dtype=bool)
     assert _parts([range(0, 12)], chosen, 3) == [range(0, 3), range(8, 12)]
