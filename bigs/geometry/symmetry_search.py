@@ -62,7 +62,10 @@ class SymmetryConfig:
 
 
 def find_symmetries(
-    surface: SeenSurface, is_empty: EmptySpace, config: SymmetryConfig = SymmetryConfig()
+    surface: SeenSurface,
+    is_empty: EmptySpace,
+    config: SymmetryConfig = SymmetryConfig(),
+    earlier: Sequence[Symmetry] = (),
 ) -> list[Symmetry]:
     """The symmetries with strong evidence, in the order in which they were found; often none.
 
@@ -73,13 +76,16 @@ def find_symmetries(
         surface: what was seen, at least a few hundred samples.
         is_empty: where nothing is.
         config: what counts as strong.
+        earlier: symmetries with strong evidence on a surface much like this one. They are candidates that are
+            near the right place: where the votes lead, another may pass before the right one is polished.
     """
     found: list[Symmetry] = []
     while len(found) < _MOST and len(surface.points) >= 100:
         judge = _Judge(surface, is_empty, config)
         # An axis completes more than any plane, and only a body of revolution passes as one.
-        best = None if found else judge.best(_axis_candidates(surface), found)
-        best = best or judge.best(_plane_candidates(surface) + judge.planes_across(found), found)
+        axes, planes = ([s for s in earlier if s.kind == kind] for kind in ("axis", "plane"))
+        best = None if found else judge.best(_axis_candidates(surface), found, axes)
+        best = best or judge.best(_plane_candidates(surface) + judge.planes_across(found), found, planes)
         if best is None:
             break
         found.append(best)
@@ -147,14 +153,19 @@ class _Judge:
                     found.append(Symmetry("plane", middle, normal))
         return self._placed(found)
 
-    def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
-        """The refined candidate that agrees best; None if that is not enough."""
+    def best(
+        self, candidates: list[Symmetry], known: list[Symmetry], earlier: list[Symmetry]
+    ) -> Symmetry | None:
+        """The refined candidate, or the earlier one, that agrees best; None if that is not enough."""
         if not candidates:
             return None
         finalists = self._distinct(self.ranked(candidates), known)[:_FINALISTS]
         refined = self._distinct(self.ranked(self._placed(self._refined(finalists))), known)
         for first in range(0, len(refined), _POLISHED):
-            polished = [self._polished(symmetry) for symmetry in refined[first : first + _POLISHED]]
+            chosen = refined[first : first + _POLISHED]
+            if first == 0:
+                chosen += self._distinct(earlier, known)
+            polished = [self._polished(symmetry) for symmetry in chosen]
             for symmetry in self.ranked(polished):
                 (found,) = self.agreement([symmetry])
                 if self._is_strong(symmetry, found, known):

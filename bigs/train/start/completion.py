@@ -59,7 +59,8 @@ def complete(
 
     Args:
         hull, start, initial, config: see those classes.
-        earlier: symmetries for which the evidence was strong before; they count if there is none now.
+        earlier: symmetries for which the evidence was strong before; they are candidates, and they count if
+            the evidence is not strong for any now.
     """
     plain = hull.closed(initial, hull.points, hull.normals, initial.surface_reach)
     points, normals, seen = seen_samples(hull.views, plain, initial.seen_frames, initial.seen_tolerance)
@@ -72,7 +73,7 @@ def complete(
     colors = np.full((len(start.points), 3), 0.5) if start.colors is None else start.colors
     surface = SeenSurface(points[measured], normals[measured], colors[nearest[measured]])
     is_empty = _empty_space(hull, surface, initial)
-    symmetries = find_symmetries(surface, is_empty, config.symmetry) or list(earlier)
+    symmetries = find_symmetries(surface, is_empty, config.symmetry, earlier) or list(earlier)
     if not symmetries:
         return replace(nothing, why_not="no strong evidence for any")
     known = SeenSurface(hull.points, hull.normals, colors[tree.query(hull.points)[1]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,13 @@ from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.symmetry import Symmetry
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
 from bigs.train.plan.presets import SMOKE
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
+from bigs.train.start import completion
 from bigs.train.start.build import build_scene
 from bigs.train.start.completion import Completion, complete
 from bigs.train.start.initial import ObjectStart, object_in_camera, smooth_object
@@ -83,6 +86,22 @@ def test_symmetries_found_earlier_count_if_there_are_none_now(
     again = complete(hull, start, INITIAL, strict, found.symmetries)
     assert again.symmetries == found.symmetries
     np.testing.assert_array_equal(again.surface.values, found.surface.values)
+
+
+def test_symmetries_found_earlier_are_candidates(
+    one_side: tuple[Clip, ObjectHull, ObjectStart], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, hull, start = one_side
+    plane = Symmetry("plane", np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    asked: list[Sequence[Symmetry]] = []
+
+    def search(*args: object) -> list[Symmetry]:
+        asked.append(args[3])  # type: ignore[arg-type]
+        return []
+
+    monkeypatch.setattr(completion, "find_symmetries", search)
+    assert complete(hull, start, INITIAL, CompletionConfig(), [plane]).symmetries == [plane]
+    assert asked == [[plane]]
 
 
 def test_less_counts_as_seen_the_more_frames_must_show_it(
