@@ -82,7 +82,7 @@ class Clip:
     )  # [3] metres: x_world = diag(1, -1, -1) x_cam + normalize_shift in HOLD's files
     mask_areas: dict[Entity, np.ndarray]  # [T] pixels of each entity in the mask files, for every entity
     fps: float = USUAL_FPS  # frames a second
-    pace: float | None = None  # at how many a second things move as here, if at clearly fewer (see `pace`)
+    pace: float | None = None  # the rate at which things usually move as here, if clearly slower (see `pace`)
     annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right

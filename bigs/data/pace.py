@@ -44,14 +44,14 @@ def with_pace(clip: Clip) -> Clip:
         found = _acceleration(places)
         if found is not None:
             accelerations.append(found)
-    slowest = USUAL_FPS * np.sqrt(_USUAL_ACCELERATION / max(min(accelerations, default=0.0), 1e-9))
-    if slowest >= _BELIEVED * clip.fps:
+    pace = USUAL_FPS * np.sqrt(_USUAL_ACCELERATION / max(min(accelerations, default=0.0), 1e-9))
+    if pace >= _BELIEVED * clip.fps:
         return clip
     note = (
         f"frames a second: {clip.fps:.3g}, yet hands and object move from frame to frame as they usually do "
-        f"at {slowest:.0f}; the plan allows for it (bigs convert --fps states a clip's rate)"
+        f"at {pace:.0f}; the plan allows for it (bigs convert --fps states a clip's rate)"
     )
-    return replace(clip, pace=float(slowest), notes=(*clip.notes, note))
+    return replace(clip, pace=float(pace), notes=(*clip.notes, note))
 
 
 def _middles(labels: np.ndarray) -> dict[Entity, np.ndarray]:

@@ -41,7 +41,7 @@ class Prices(NamedTuple):
 
     @property
     def rest(self) -> float:
-        """Price of a hand that rests, likewise: what a still hand and a still object show proves no grasp."""
+        """Price of a hand that rests, likewise; less, so that only a shared motion proves a grasp."""
         return 0.5 * self.grasp
 
     @property
