@@ -254,7 +254,7 @@ class OpeningConfig:
     measured: float = 0.004
     # Surface that lies deeper than this in a hand that holds the object for as many frames is not there,
     # metres: hands that were drawn to the surface are off by less.
-    inside: float = 0.003
+    inside: float = 0.004
 
 
 Stage = (
