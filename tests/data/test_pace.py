@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,12 @@ import pytest
 from PIL import Image
 from toy_clips import painted_clip
 
+from bigs.commands.clips.open import open_clip
+from bigs.data import pace
 from bigs.data.base import Clip
 from bigs.data.pace import with_pace
-from bigs.types import MASK_VALUES, Entity
+from bigs.hand import HandModel
+from bigs.types import MASK_VALUES, Entity, Side
 
 HEIGHT, WIDTH = 120, 160
 # Metres from the camera, and pixels of focal length: a pixel is 2.5 mm.
@@ -104,6 +108,16 @@ def test_frames_without_masks_are_left_out(tmp_path: Path) -> None:
     for t in (5, 21):
         Image.fromarray(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)).save(clip.mask_paths[t])
     assert with_pace(clip).pace == pytest.approx(10.0, rel=0.35)
+
+
+def test_clips_are_opened_with_their_pace(
+    tiny_clip: Path, both_hands: Mapping[Side, HandModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The little clip turns its object within twelve frames, which are too few otherwise."""
+    assert open_clip(tiny_clip, both_hands).pace is None
+    monkeypatch.setattr(pace, "_LEAST", 6)
+    clip = open_clip(tiny_clip, both_hands)
+    assert clip.pace is not None and clip.pace < 20.0 and "frames a second: 30" in clip.notes[-1]
 
 
 def test_no_masks_no_pace(tmp_path: Path) -> None:

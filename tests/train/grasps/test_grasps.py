@@ -222,6 +222,17 @@ def test_a_still_hand_on_a_still_object_proves_no_grasp(
         assert abs(a.start - b.start) <= 1 and abs(a.stop - b.stop) <= 1
 
 
+def test_a_slow_grasp_is_none_that_rests() -> None:
+    """Pictures hardly tell, but the object moves, and so somebody moves it."""
+    scene, truth = waiting_scene(0.06, 0.0008), waiting_scene(0.06, 0.0008)
+
+    def mismatch(side: Side, poses: HandFrames, frames: torch.Tensor) -> torch.Tensor:
+        return (poses.wrist - truth.at(ALL).hand(side).wrist).norm(dim=-1) / 0.1
+
+    found = find_grasps(scene, STAGE, EVERYWHERE, mismatch)["right"].stretches
+    assert len(found) == 2 and found[0].start == 0 and abs(found[0].stop - 9) <= 1
+
+
 @pytest.mark.parametrize("turns", [False, True])
 @pytest.mark.parametrize(
     ("drift", "rests"),
