@@ -6,12 +6,15 @@ It also fills the grip of a hand that never lets go, where the hand itself is.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
 import scipy.spatial
 import torch
+from torch import Tensor
 
 from bigs.fused.shape import times_empty
 from bigs.geometry.coverage import MeasuredPoints, ObjectViews, seen_in
@@ -20,6 +23,7 @@ from bigs.models.scene import ObjectSurface, Scene
 from bigs.train.loop.step import Evidence
 from bigs.train.plan.config import OpeningConfig
 from bigs.train.unseen.visibility import TOLERANCE, object_views
+from bigs.types import Side
 
 # At least so many samples of a hand's surface that may show, about so many of the object's that may hide it.
 _HAND_SAMPLES, _OCCLUDERS = 8000, 20_000
@@ -57,12 +61,13 @@ def openings(
     views = object_views(scene, evidence)
     area = _vertex_areas(verts, faces)
     unmeasured = scipy.spatial.cKDTree(measured.points).query(verts)[0] > config.measured
-    gripped = unmeasured & _in_grips(scene, verts, config)
+    hands = {side: _on_object(scene, side) for side in scene.sides}
+    gripped = unmeasured & _in_grips(scene, hands, verts, config)
     gripped &= _with_proof(faces, gripped, area * gripped, config.area)
     least, least_points = (
         max(config.frames, share * scene.n_frames) for share in (config.share, config.points_share)
     )
-    proven = _hands_behind(scene, evidence, views, verts, config.depth) >= least
+    proven = _hands_behind(hands, evidence, views, verts, config.depth) >= least
     proven |= _points_behind(views, verts, measured, config.depth) >= least_points
     proven &= unmeasured
     if area[proven].sum() < config.area:
@@ -81,24 +86,36 @@ def without_openings(surface: ObjectSurface, open_: np.ndarray) -> ObjectSurface
     return ObjectSurface(surface.verts[torch.as_tensor(used)], torch.as_tensor(kept.reshape(-1, 3)))
 
 
+class _Hand(NamedTuple):
+    """A hand as the object sees it."""
+
+    verts: Tensor  # [T, V, 3] in the object's frame
+    faces: np.ndarray  # [F, 3]
+    follow: scipy.sparse.csr_matrix  # [N, V] samples of its surface
+
+
+def _on_object(scene: Scene, side: Side) -> _Hand:
+    posed, model = scene.at(torch.arange(scene.n_frames)), scene.hand_model(side)
+    with torch.no_grad():
+        verts = posed.in_object_frame(posed.verts(side))
+    faces = model.faces_of(side).numpy()
+    # The same places in every frame: spreading samples anew takes seconds.
+    return _Hand(verts, faces, _places(faces, len(model.v_template)))
+
+
 def _hands_behind(
-    scene: Scene, evidence: Evidence, views: ObjectViews, verts: np.ndarray, depth: float
+    hands: Mapping[Side, _Hand], evidence: Evidence, views: ObjectViews, verts: np.ndarray, depth: float
 ) -> np.ndarray:
     """In how many frames [V] a hand shows more than `depth` behind vertices [V, 3]; each hand counts."""
-    posed = scene.at(torch.arange(scene.n_frames))
     count = np.zeros(len(verts), dtype=np.int64)
-    for side in scene.sides:
-        model = scene.hand_model(side)
-        # The same places in every frame: spreading samples anew takes seconds.
-        follow = _places(model.faces.numpy(), len(model.v_template))
-        with torch.no_grad():
-            hand = posed.in_object_frame(posed.verts(side)).double().numpy()
+    for side, hand in hands.items():
         shown = evidence.targets.shares[side].numpy() > 0.5
         inside = scipy.ndimage.binary_erosion(shown, np.ones((1, 3, 3)), iterations=_MARGIN)
         for t in np.flatnonzero(inside.any(axis=(1, 2))):
             one = slice(t, t + 1)
             frame = ObjectViews(inside[one], views.K, views.rotations[one], views.centers[one])
-            count += times_empty(frame.shown, frame.poses, verts, follow @ hand[t], depth)
+            places = hand.follow @ hand.verts[t].double().numpy()
+            count += times_empty(frame.shown, frame.poses, verts, places, depth)
     return count
 
 
@@ -116,23 +133,20 @@ def _points_behind(
     return count
 
 
-def _in_grips(scene: Scene, verts: np.ndarray, config: OpeningConfig) -> np.ndarray:
+def _in_grips(
+    scene: Scene, hands: Mapping[Side, _Hand], verts: np.ndarray, config: OpeningConfig
+) -> np.ndarray:
     """Which vertices [V] (bool) lie inside a hand that holds the object for as many frames as count."""
     inside = np.zeros(len(verts), dtype=bool)
-    posed = scene.at(torch.arange(scene.n_frames))
-    for side in scene.sides:
-        grasps, model = scene.grasps[side], scene.hand_model(side)
-        faces = model.faces_of(side).numpy()
-        follow = _places(faces, len(model.v_template))
-        with torch.no_grad():
-            hands = posed.in_object_frame(posed.verts(side))
+    for side, hand in hands.items():
+        grasps = scene.grasps[side]
         for grasp in range(grasps.count):
             held = grasps.of_frame == grasp
             if held.sum() < config.frames:
                 continue
-            hand = hands[held].median(0).values.double().numpy()
-            normals = follow @ vertex_normals(hand, faces)
-            places = follow @ hand
+            usual = hand.verts[held].median(0).values.double().numpy()
+            places = hand.follow @ usual
+            normals = hand.follow @ vertex_normals(usual, hand.faces)
             nearest = scipy.spatial.cKDTree(places).query(verts)[1]
             inside |= ((places[nearest] - verts) * normals[nearest]).sum(-1) > config.inside
     return inside
