@@ -87,6 +87,7 @@ class Clip:
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right
     gains: np.ndarray | None = None  # [T, 3] how many times as bright as usual the files' channels are
+    brightness: float = 1.0  # of the files, as a share of what `image` shows (see `bigs.data.brightness`)
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:
@@ -97,11 +98,14 @@ class Clip:
 
     def image(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB, in the clip's usual exposure."""
-        image = self.image_as_taken(t)
-        return image if self.gains is None else _divided(image, self.gains[t])
+        gain = np.ones(3) if self.gains is None else self.gains[t]
+        return _divided(self._pinhole_image(t), gain * self.brightness)
 
     def image_as_taken(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB, in its own exposure."""
+        return _divided(self._pinhole_image(t), np.full(3, self.brightness))
+
+    def _pinhole_image(self, t: int) -> np.ndarray:
         if self.optics is None:
             return read_image(self.image_paths[t], (self.width, self.height))
         return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
@@ -121,5 +125,7 @@ class Clip:
 
 def _divided(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """An image [H, W, 3] uint8 with its channels divided by a gain [3]."""
+    if (gain == 1.0).all():
+        return image
     table = (np.arange(256)[:, None] / gain).round().clip(0, 255).astype(np.uint8)
     return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)

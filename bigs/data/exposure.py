@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.data.brightness import brightened
 from bigs.threads import side_by_side
 
 # Long side in pixels at which frames are compared, and the sides of the cells whose means are compared: noise
@@ -40,7 +41,8 @@ def with_one_exposure(clip: Clip) -> Clip:
         return clip
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
-    images = np.stack(side_by_side(lambda t: clip.image(t)[::step, ::step], frames))
+    shown = brightened(clip)
+    images = np.stack(side_by_side(lambda t: shown.image(t)[::step, ::step], frames))
     background = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step] == 0, frames))
     gains = _gains(images, background)
     if not (np.abs(gains - 1.0) > _STEADY).any():

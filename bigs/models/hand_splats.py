@@ -47,8 +47,12 @@ class HandSplatsConfig:
     flatness: float = 0.35
     opacity: float = 0.95
     max_offset: float = 0.003
-    # The mean colour of skin under white light; only a start, since a stage may take the images' own.
-    color: tuple[float, float, float] = (0.7, 0.55, 0.45)
+    # The mean colour at the start; None takes what the pictures show of the hands. A stage may change it.
+    color: tuple[float, float, float] | None = None
+
+
+# The mean colour of light skin under white light, where nothing shows the hands.
+_SKIN = (0.7, 0.55, 0.45)
 
 
 class HandSplats(nn.Module):
@@ -61,8 +65,10 @@ class HandSplats(nn.Module):
     base_quats: Tensor
     base_log_scales: Tensor
 
-    def __init__(self, model: HandModel, config: HandSplatsConfig) -> None:
-        """`model` is the right hand."""
+    def __init__(
+        self, model: HandModel, config: HandSplatsConfig, color: tuple[float, float, float] | None = None
+    ) -> None:
+        """`model` is the right hand; `color` the hands', if known, where the configuration has none."""
         super().__init__()
         self.model = model
         self.config = config
@@ -106,7 +112,7 @@ class HandSplats(nn.Module):
         self.appearance = AppearanceDecoder(features, config.decoders.appearance_width)
         self.geometry = GeometryDecoder(features, config.decoders.geometry_width, config.max_offset)
         self.skinning = SkinningDecoder(features, config.decoders.skinning_width)
-        self.color = nn.Parameter(torch.logit(torch.tensor(config.color)))
+        self.color = nn.Parameter(torch.logit(torch.tensor(config.color or color or _SKIN)))
 
     def forward(self) -> CanonicalHand:
         """Evaluate the fields once."""

@@ -222,7 +222,10 @@ def record(
         fps: frames a second of the clip.
     """
     frames = torch.arange(scene.n_frames)
-    canonical = scene.canonical(scene.entities)
+    canonical = {
+        entity: splats._replace(colors=splats.colors * scene.brightness)
+        for entity, splats in scene.canonical(scene.entities).items()
+    }
     hands: dict[Side, HandPlayback] = {}
     lighting = Lighting(scene.entities, scene.n_frames) if scene.lighting is None else scene.lighting
     shade = {entity: value.detach().clone() for entity, value in lighting.shade.items()}

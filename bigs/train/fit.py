@@ -11,6 +11,7 @@ import torch
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
+from bigs.data.brightness import brightened
 from bigs.data.focal import with_focal_factor
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
@@ -123,6 +124,9 @@ def fit(
     torch.manual_seed(config.seed)
     watch = watch or Stopwatch("start values")
     watch.begin("start values")
+    clip = brightened(clip)
+    if clip.brightness < 1.0:
+        report.facts["pictures"] = f"dark; fitted as if {1.0 / clip.brightness:.1f} times as bright"
     # Few of the tracker's operations are parallel, so there is a core to spare beside it.
     occluders = beside().submit(unknown_occluders, clip)
     motion = None
@@ -148,6 +152,7 @@ def fit(
         motion,
     )
     scene = start.scene
+    scene.brightness = clip.brightness
     gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
     report.skipped += start.skipped
     report.seconds = watch.read()

@@ -51,6 +51,16 @@ def test_a_recording_shows_what_the_scene_shows(pair) -> None:
 
 
 @torch.no_grad()
+def test_a_recording_is_as_dark_as_the_clip() -> None:
+    scene = make_scene(rich=True)
+    bright = record(scene, "clip", NAMES, SHIFT).gaussians([1])
+    scene.brightness = 0.3
+    dark = record(scene, "clip", NAMES, SHIFT).gaussians([1])
+    torch.testing.assert_close(dark.colors, 0.3 * bright.colors)
+    assert torch.equal(dark.means, bright.means) and torch.equal(dark.opacities, bright.opacities)
+
+
+@torch.no_grad()
 def test_the_trajectory_is_the_scenes_meshes(pair) -> None:
     scene, playback = pair
     trajectory = playback.trajectory()

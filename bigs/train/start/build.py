@@ -26,6 +26,7 @@ from bigs.models.scene import ObjectSurface, Scene
 from bigs.motion.tracker import TrackedMotion
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.completion import complete
+from bigs.train.start.hand_color import hand_color
 from bigs.train.start.initial import ObjectStart, hand_in_camera, object_in_camera, smooth_hand, smooth_object
 from bigs.train.start.object_motion import pose_errors, with_motion
 from bigs.train.start.visual_hull import convex_surface, find_object_hull
@@ -85,6 +86,7 @@ def build_scene(
         for side, track in clip.hands.items()
     }
     canonical = _canonical_hands(clip, hand_models, hand)
+    seen = hand_color(clip) if canonical else None
     skipped: list[str] = []
     symmetries: list[Symmetry] = []
     known = None
@@ -120,7 +122,7 @@ def build_scene(
         K=torch.as_tensor(clip.K, dtype=torch.float32),
         width=clip.width,
         height=clip.height,
-        hand_splats={side: HandSplats(model, hand) for side, (model, _) in canonical.items()},
+        hand_splats={side: HandSplats(model, hand, seen) for side, (model, _) in canonical.items()},
         betas={side: betas for side, (_, betas) in canonical.items()},
         hand_poses={
             side: HandPoses(start.global_orient, start.hand_pose, start.wrist)

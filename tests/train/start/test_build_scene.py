@@ -21,6 +21,7 @@ from bigs.raster import rasterization
 from bigs.train.plan.presets import SMOKE
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.build import SceneStart, build_scene, likely_shape
+from bigs.train.start.hand_color import hand_color
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import MASK_VALUES, SIDES, Entity, Side
 
@@ -210,6 +211,13 @@ def test_building_is_deterministic(tiny: Clip, both_hands: dict[Side, HandModel]
     first, second = (build(tiny, both_hands).scene.state_dict() for _ in range(2))
     assert first.keys() == second.keys()
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@torch.no_grad()
+def test_hands_start_in_the_colour_of_the_pictures(scene: Scene, tiny: Clip) -> None:
+    seen = hand_color(tiny)
+    assert seen is not None
+    torch.testing.assert_close(torch.sigmoid(scene.hand_splats["right"].color), torch.tensor(seen))
 
 
 def test_without_object_masks_the_points_serve(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
