@@ -5,6 +5,7 @@ A clip's world is whatever the dataset chose; `cam_from_world` leads to the Open
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,6 +87,8 @@ class Clip:
     annotated: bool = False  # the tracks are a data set's truth; no reconstruction may start from them
     optics: Optics | None = None  # how the files differ from pinhole images, if they do
     swapped: np.ndarray | None = None  # [T] bool: the mask files call the right hand left, and the left right
+    # Lines [T, 3] across the wrists of hands whose masks go on over the arm (see `forearms`).
+    arms: Mapping[Side, np.ndarray] | None = None
     gains: np.ndarray | None = None  # [T, 3] how many times as bright as usual the files' channels are
     brightness: float = 1.0  # of the files, as a share of what `image` shows (see `bigs.data.brightness`)
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
@@ -111,7 +114,22 @@ class Clip:
         return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
 
     def mask(self, t: int) -> np.ndarray:
-        """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`."""
+        """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`. Arms are background."""
+        labels = self.mask_with_arms(t)
+        return labels if self.arms is None else np.where(self._arm(t, labels), np.uint8(0), labels)
+
+    def arm(self, t: int) -> np.ndarray:
+        """Where the masks of frame `t` call an arm a hand, [H, W] bool."""
+        return self._arm(t, self.mask_with_arms(t))
+
+    def _arm(self, t: int, labels: np.ndarray) -> np.ndarray:
+        found = np.zeros(labels.shape, dtype=bool)
+        for side, lines in (self.arms or {}).items():
+            found |= beyond_line(lines[t], labels.shape) & (labels == MASK_VALUES[side])
+        return found
+
+    def mask_with_arms(self, t: int) -> np.ndarray:
+        """Labels of frame `t`, [H, W] uint8, in which arms belong to hands wherever the files say so."""
         if self.optics is None:
             labels = read_mask(self.mask_paths[t], (self.width, self.height))
         else:
@@ -121,6 +139,13 @@ class Clip:
     def has_pixels(self, entity: Entity) -> np.ndarray:
         """In which frames the masks show `entity`, [T] bool."""
         return self.mask_areas[entity] > 0
+
+
+def beyond_line(line: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which pixels (x, y) of an image of that shape have a x + b y + c > 0, bool [H, W], for a line [3]."""
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    a, b, c = line
+    return a * (columns + 0.5) + b * (rows + 0.5) + c > 0.0
 
 
 def _divided(image: np.ndarray, gain: np.ndarray) -> np.ndarray:

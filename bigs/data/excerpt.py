@@ -50,6 +50,7 @@ def excerpt(clip: Clip, frames: np.ndarray) -> Clip:
         object=obj,
         optics=None if clip.optics is None else clip.optics.chosen(frames),
         swapped=None if clip.swapped is None else clip.swapped[frames],
+        arms=None if clip.arms is None else {side: lines[frames] for side, lines in clip.arms.items()},
         gains=None if clip.gains is None else clip.gains[frames],
         mask_areas={entity: areas[frames] for entity, areas in clip.mask_areas.items()},
     )

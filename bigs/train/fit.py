@@ -48,6 +48,7 @@ from bigs.train.plan.rate import at_rate
 from bigs.train.resolve import asks_prior
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.build import build_scene
+from bigs.train.start.initial import initial_trajectory
 from bigs.train.start.object_motion import find_object_motion, in_words
 from bigs.train.unseen.stages import OBSERVED_AT, finish_mesh, run_completion, run_guidance
 from bigs.train.unseen.visibility import shown
@@ -128,7 +129,7 @@ def fit(
     if clip.brightness < 1.0:
         report.facts["pictures"] = f"dark; fitted as if {1.0 / clip.brightness:.1f} times as bright"
     # Few of the tracker's operations are parallel, so there is a core to spare beside it.
-    occluders = beside().submit(unknown_occluders, clip)
+    occluders = beside().submit(unknown_occluders, clip, initial_trajectory(clip, hand_models).joints)
     motion = None
     if config.stages and isinstance(config.stages[0], ObjectMotionStage):
         watch.begin(config.stages[0].name)

@@ -79,7 +79,7 @@ def convert(
         check_pairs(clip.image_paths, masks)
         size = (clip.width, clip.height) if clip.optics is None else clip.optics.file_size
         areas = decode_frames((), masks, size)
-        clip = replace(clip, mask_paths=masks, mask_areas=areas)
+        clip = replace(clip, mask_paths=masks, mask_areas=areas, swapped=None, arms=None)
     if not clip.mask_paths:
         raise InputError(f"{source}: expected label masks (--masks), found none")
     clip, notes = _chosen(clip, plan)
@@ -201,7 +201,7 @@ def _pictures(clip: Clip, size: tuple[int, int]) -> Iterator[np.ndarray]:
 
 def _labels(clip: Clip, size: tuple[int, int]) -> Iterator[np.ndarray]:
     for t in range(len(clip)):
-        mask = clip.mask(t)
+        mask = clip.mask_with_arms(t)
         yield mask if size == (clip.width, clip.height) else _scaled(mask, size, Image.Resampling.NEAREST)
 
 

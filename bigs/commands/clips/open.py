@@ -8,6 +8,7 @@ from pathlib import Path
 from bigs.checks import InputError
 from bigs.data.base import Clip
 from bigs.data.exposure import with_one_exposure
+from bigs.data.forearms import without_arms
 from bigs.data.formats.layouts import load_clip
 from bigs.data.pace import with_pace
 from bigs.data.plausible import plausible
@@ -28,7 +29,8 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
     clip = plausible(clip, wrists)
     if clip.annotated:
         return clip
-    clip = with_labels_sorted(clip, initial_trajectory(clip, hand_models).joints)
+    joints = initial_trajectory(clip, hand_models).joints
+    clip = without_arms(with_labels_sorted(clip, joints), joints)
     return with_pace(with_one_exposure(clip))
 
 

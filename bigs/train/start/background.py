@@ -4,11 +4,12 @@ Masks label a sleeve as background, yet it hides a hand as an object does. With 
 background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
 most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
 colours, the one that the clip's occluders have elsewhere belongs to an occluder. Before a background that
-moves nothing is known but which masks were lost: what they showed may still be there.
+moves only arms are looked for (see `arms`), and masks that were lost: what they showed may still be there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,9 @@ from bigs.data.base import Clip
 from bigs.data.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
-from bigs.types import MASK_VALUES
+from bigs.train.start.arms import arms
+from bigs.train.start.color_counts import color_cells, color_counts, smoothed
+from bigs.types import MASK_VALUES, Side
 
 # Colours (in [0, 1]) that differ by more than this belong to different surfaces; noise and soft shadows
 # differ less.
@@ -27,11 +30,8 @@ _THRESHOLD = 0.06
 _SIZE = 320
 # A pixel that shows something else in this share of its frames may show an occluder in most of them.
 _CONTESTED_SHARE = 0.05
-# How colours of occluders and background are counted: cells along each channel, and rounds of counting and
-# deciding. Neighbours within some compared pixels decide together.
-_COLOR_CELLS = 16
+# Rounds of counting colours of occluders and background, and of deciding.
 _ROUNDS = 8
-_NEIGHBOURHOOD = 2.0
 # How far, in compared pixels, a subject may have moved beyond where the frames around show it.
 _MOVED = 10
 # Half the width, in compared pixels, of holes that are closed.
@@ -40,11 +40,16 @@ _CLOSE = 5
 _USELESS_SHARE = 0.5
 
 
-def unknown_occluders(clip: Clip) -> np.ndarray:
+def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarray:
     """Where an unlabelled occluder may hide a hand or the object.
 
+    Args:
+        clip: with masks.
+        joints: [T, 21, 3] of each hand in camera space, as estimated.
+
     Returns:
-        [T, H, W] bool at the clip's size. When the background does not stand still, only what masks lost.
+        [T, H, W] bool at the clip's size. When the background does not stand still, only arms and what masks
+        lost.
     """
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
@@ -57,9 +62,13 @@ def unknown_occluders(clip: Clip) -> np.ndarray:
         np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
         & background
     )
-    unknown = (
-        _lost(labels) if unknown.sum() > _USELESS_SHARE * background.sum() else _whole(unknown, background)
-    )
+    if unknown.sum() > _USELESS_SHARE * background.sum():
+        K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
+        unknown = _lost(labels) | _whole(arms(images, background, joints, K), background)
+    else:
+        unknown = _whole(unknown, background)
+    if clip.arms is not None:
+        unknown |= np.stack(side_by_side(lambda t: clip.arm(t)[::step, ::step], frames))
     return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
 
 
@@ -129,7 +138,7 @@ def _still_background(looks: _Looks) -> np.ndarray:
     usual, other, usual_frames, other_frames = looks
     contested = other_frames > _CONTESTED_SHARE * (usual_frames + other_frames)
     swapped = np.zeros(contested.shape, dtype=bool)
-    area = _smoothed(contested.astype(np.float64))
+    area = smoothed(contested.astype(np.float64))
     # What is seen more often is more likely the background.
     odds = np.log((usual_frames + 1) / (other_frames + 1))
     for _ in range(_ROUNDS if contested.any() else 0):
@@ -137,11 +146,11 @@ def _still_background(looks: _Looks) -> np.ndarray:
         still_frames, moving_frames = np.where(
             swapped, (other_frames, usual_frames), (usual_frames, other_frames)
         )
-        of_background = _color_counts(still, still_frames)
-        of_occluders = _color_counts(moving, np.where(contested, moving_frames, 0))
+        of_background = color_counts(still, still_frames)
+        of_occluders = color_counts(moving, np.where(contested, moving_frames, 0))
         gain = odds + _log_ratio(other, of_occluders, of_background)
         gain -= _log_ratio(usual, of_occluders, of_background)
-        gain = _smoothed(np.where(contested, gain, 0.0)) / np.maximum(area, 1e-3)
+        gain = smoothed(np.where(contested, gain, 0.0)) / np.maximum(area, 1e-3)
         before, swapped = swapped, contested & (gain < 0.0)
         if (swapped == before).all():
             break
@@ -150,21 +159,5 @@ def _still_background(looks: _Looks) -> np.ndarray:
 
 def _log_ratio(colors: np.ndarray, counts: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Logarithm [H, W] of how much more often colours [H, W, 3] were counted than in the other histogram."""
-    cells = _cells(colors)
+    cells = color_cells(colors)
     return np.log1p(counts[cells]) - np.log1p(others[cells])
-
-
-def _smoothed(values: np.ndarray) -> np.ndarray:
-    return scipy.ndimage.gaussian_filter(values, _NEIGHBOURHOOD)
-
-
-def _cells(colors: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The cells of the colour histogram that colours [..., 3] fall into, an index array for each channel."""
-    return tuple(np.moveaxis((colors * _COLOR_CELLS).astype(int).clip(0, _COLOR_CELLS - 1), -1, 0))
-
-
-def _color_counts(colors: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """How many frames [H, W] show each colour [H, W, 3], as a smooth histogram [cells, cells, cells]."""
-    counts = np.zeros((_COLOR_CELLS,) * 3)
-    np.add.at(counts, _cells(colors), frames)
-    return scipy.ndimage.gaussian_filter(counts, 1.0, mode="constant")

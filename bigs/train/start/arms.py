@@ -1,0 +1,89 @@
+"""Arms and sleeves before a background that moves.
+
+An arm hides a hand's wrist, and masks call it background. Where that stands still, an arm is what differs.
+Otherwise two things are known: an arm goes on from the wrist, and it has the same few colours in all frames,
+which the background has no more often near a wrist than elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bigs.train.start.color_counts import color_cells, color_counts, smoothed
+from bigs.types import Side
+
+# Where an arm may be, in metres: within these distances of the wrist and of a line that goes on from it, so
+# far. Estimates of wrists err, elbows and sleeves are wide.
+_CUFF_RADIUS, _CUFF_LENGTH = 0.05, 0.06
+_ARM_RADIUS, _ARM_LENGTH = 0.08, 0.35
+# Colours that are so many times as frequent near wrists as elsewhere are those of arms.
+_TIMES = 2.0
+# If less of what is near a wrist has such colours, they do not tell the arm from the background.
+_LEAST_SHARE = 0.2
+# A colour that was never seen counts as if this share of all pixels had it.
+_NEVER = 1e-4
+# Index of the middle finger's first joint.
+_KNUCKLE = 4
+
+
+def arms(
+    images: np.ndarray, background: np.ndarray, joints: Mapping[Side, np.ndarray], K: np.ndarray
+) -> np.ndarray:
+    """Where arms and sleeves may hide a hand.
+
+    Args:
+        images: [T, H, W, 3] uint8.
+        background: [T, H, W] bool, what no mask claims.
+        joints: [T, 21, 3] of each hand in camera space, as estimated.
+        K: [3, 3] of the images.
+
+    Returns:
+        [T, H, W] bool, part of the background. Where colours do not tell an arm, all of its cuff.
+    """
+    cuffs = {
+        side: _beyond(places, K, images.shape[:3], _CUFF_RADIUS, _CUFF_LENGTH)
+        for side, places in joints.items()
+    }
+    wide = [_beyond(places, K, images.shape[:3], _ARM_RADIUS, _ARM_LENGTH) for places in joints.values()]
+    near, reached = (np.any([np.zeros_like(background), *parts], axis=0) for parts in (cuffs.values(), wide))
+    ratio = _log_ratio(images, near & background, background & ~reached)
+    colored = ratio > np.log(_TIMES)
+    found = reached & colored
+    for cuff in cuffs.values():
+        shown = cuff & background
+        if colored[shown].sum() < _LEAST_SHARE * shown.sum():
+            found |= cuff
+    return found & background
+
+
+def _beyond(
+    joints: np.ndarray, K: np.ndarray, shape: tuple[int, ...], radius: float, length: float
+) -> np.ndarray:
+    """Pixels [T, H, W] that see within `radius` of the line of `length` that goes on from a hand's wrist."""
+    found = np.zeros(shape, dtype=bool)
+    rows, columns = np.ogrid[: shape[1], : shape[2]]
+    x, y = columns + 0.5, rows + 0.5
+    wrist = joints[:, 0]
+    away = wrist - joints[:, _KNUCKLE]
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    for t, (start, end) in enumerate(zip(wrist, wrist + length * away, strict=True)):
+        if min(start[2], end[2]) <= radius:
+            continue
+        (x0, y0), (x1, y1) = ((K @ point)[:2] / point[2] for point in (start, end))
+        along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / max((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6)
+        along = along.clip(0.0, 1.0)
+        reach = K[0, 0] * radius / (start[2] + along * (end[2] - start[2]))
+        found[t] = np.hypot(x - x0 - along * (x1 - x0), y - y0 - along * (y1 - y0)) < reach
+    return found
+
+
+def _log_ratio(images: np.ndarray, near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Logarithm [T, H, W] of how many times as frequent colours are where `near` than where `far`."""
+    shares = []
+    for chosen in (near, far):
+        counts = color_counts(images[chosen] / np.float32(255.0), np.ones(chosen.sum()))
+        shares.append(np.log(counts / max(counts.sum(), 1.0) + _NEVER))
+    table = shares[0] - shares[1]
+    return np.stack([smoothed(table[color_cells(image / np.float32(255.0))]) for image in images])
