@@ -49,7 +49,8 @@ def without_arms(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Clip:
     clip = replace(clip, arms=arms)
     shown = side_by_side(lambda t: np.bincount(clip.mask(t).ravel(), minlength=256), frames)
     areas = clip.mask_areas | {side: np.array(shown)[:, MASK_VALUES[side]] for side in arms}
-    note = f"masks: those of the {' and '.join(arms)} hand go on over the arm; cut at the wrist"
+    whose = "those of both hands go" if len(arms) == 2 else f"that of the {next(iter(arms))} hand goes"
+    note = f"masks: {whose} on over the arm; cut at the wrist"
     return replace(clip, mask_areas=areas, notes=(*clip.notes, note))
 
 

@@ -28,34 +28,49 @@ _NEVER = 1e-4
 _KNUCKLE = 4
 
 
+def arm_reach(joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which pixels of T images an arm may cover: bool of that shape, [T, H, W].
+
+    Args:
+        joints: [T, 21, 3] of each hand in camera space, as estimated.
+        K: [3, 3] of the images.
+        shape: of the images.
+    """
+    found = np.zeros(shape, dtype=bool)
+    for places in joints.values():
+        found |= _beyond(places, K, shape, _ARM_RADIUS, _ARM_LENGTH)
+    return found
+
+
 def arms(
-    images: np.ndarray, background: np.ndarray, joints: Mapping[Side, np.ndarray], K: np.ndarray
+    images: np.ndarray,
+    background: np.ndarray,
+    reach: np.ndarray,
+    joints: Mapping[Side, np.ndarray],
+    K: np.ndarray,
 ) -> np.ndarray:
     """Where arms and sleeves may hide a hand.
 
     Args:
         images: [T, H, W, 3] uint8.
         background: [T, H, W] bool, what no mask claims.
-        joints: [T, 21, 3] of each hand in camera space, as estimated.
-        K: [3, 3] of the images.
+        reach: [T, H, W] bool, of `arm_reach`.
+        joints, K: as there.
 
     Returns:
         [T, H, W] bool, part of the background. Where colours do not tell an arm, all of its cuff.
     """
-    cuffs = {
-        side: _beyond(places, K, images.shape[:3], _CUFF_RADIUS, _CUFF_LENGTH)
-        for side, places in joints.items()
-    }
-    wide = [_beyond(places, K, images.shape[:3], _ARM_RADIUS, _ARM_LENGTH) for places in joints.values()]
-    near, reached = (np.any([np.zeros_like(background), *parts], axis=0) for parts in (cuffs.values(), wide))
-    ratio = _log_ratio(images, near & background, background & ~reached)
-    colored = ratio > np.log(_TIMES)
-    found = reached & colored
-    for cuff in cuffs.values():
-        shown = cuff & background
-        if colored[shown].sum() < _LEAST_SHARE * shown.sum():
+    cuffs = [
+        background & _beyond(places, K, background.shape, _CUFF_RADIUS, _CUFF_LENGTH)
+        for places in joints.values()
+    ]
+    near = np.logical_or.reduce(cuffs) if cuffs else np.zeros_like(background)
+    colored = _log_ratio(images, near, background & ~reach) > np.log(_TIMES)
+    found = reach & background & colored
+    for cuff in cuffs:
+        if colored[cuff].sum() < _LEAST_SHARE * cuff.sum():
             found |= cuff
-    return found & background
+    return found
 
 
 def _beyond(

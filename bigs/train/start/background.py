@@ -19,7 +19,7 @@ from bigs.data.base import Clip
 from bigs.data.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
-from bigs.train.start.arms import arms
+from bigs.train.start.arms import arm_reach, arms
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
 from bigs.types import MASK_VALUES, Side
 
@@ -36,8 +36,8 @@ _ROUNDS = 8
 _MOVED = 10
 # Half the width, in compared pixels, of holes that are closed.
 _CLOSE = 5
-# If more of the background moves than this, the camera moves or the light changes, and nothing is known.
-_USELESS_SHARE = 0.5
+# If more of the background differs where no arm reaches, the camera moves or the light changes.
+_MOVING_SHARE = 0.05
 
 
 def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarray:
@@ -62,9 +62,11 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarr
         np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
         & background
     )
-    if unknown.sum() > _USELESS_SHARE * background.sum():
-        K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
-        unknown = _lost(labels) | _whole(arms(images, background, joints, K), background)
+    K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
+    reach = arm_reach(joints, K, labels.shape)
+    beyond = background & ~reach
+    if unknown[beyond].sum() > _MOVING_SHARE * beyond.sum():
+        unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
     else:
         unknown = _whole(unknown, background)
     if clip.arms is not None:

@@ -35,6 +35,15 @@ def moving_box(top: int, left: int, height: int, width: int, step: int) -> np.nd
     return box
 
 
+def wrist_at(columns: np.ndarray, rows: float, away: tuple[float, float]) -> np.ndarray:
+    """Joints [T, 21, 3], half a metre from a painted clip's camera, of a hand whose arm goes that way."""
+    joints = np.full((FRAMES, 21, 3), 0.5)
+    joints[..., 0] = (columns[:, None] - WIDTH / 2) / 100.0 * 0.5
+    joints[..., 1] = (rows - HEIGHT / 2) / 100.0 * 0.5
+    joints[:, 4, :2] -= 0.08 * np.array(away)
+    return joints
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
@@ -46,7 +55,7 @@ def test_finds_a_moving_sleeve(tmp_path: Path, rng: np.random.Generator) -> None
     images[hand] = [0.8, 0.6, 0.5]
     images[sleeve] = [0.1, 0.15, 0.9]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    found = unknown_occluders(clip)
+    found = unknown_occluders(clip, {"right": wrist_at(11 + 5 * np.arange(FRAMES), 37, (0.0, 1.0))})
     assert found.shape == (FRAMES, HEIGHT, WIDTH) and found.dtype == bool
     assert found[sleeve].mean() > 0.95
     assert not found[hand].any()
@@ -61,7 +70,9 @@ def test_exposure_that_wavers_hides_no_background(tmp_path: Path, rng: np.random
     images[sleeve] = [0.1, 0.15, 0.9]
     gains = rng.uniform(0.8, 1.2, FRAMES)[:, None, None, None]
     clip = painted_clip(tmp_path, to_bytes(gains * images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    found = unknown_occluders(with_one_exposure(clip))
+    found = unknown_occluders(
+        with_one_exposure(clip), {"right": wrist_at(11 + 5 * np.arange(FRAMES), 37, (0.0, 1.0))}
+    )
     assert found[sleeve].mean() > 0.95
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 7, 7)))
     assert found[~near].mean() < 0.01
@@ -81,7 +92,13 @@ def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator) -> 
         images[t, 44:58, 4 * t : 4 * t + 16] = [0.1, 0.15, 0.9]
         sleeve[t, 44:58, 4 * t : 4 * t + 16] = True
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    found = unknown_occluders(clip)
+    found = unknown_occluders(
+        clip,
+        {
+            "right": wrist_at(np.full(FRAMES, 8.0), 28, (1.0, 0.0)),
+            "left": wrist_at(4.0 * np.arange(FRAMES), 51, (1.0, 0.0)),
+        },
+    )
     assert found[sleeve].mean() > 0.95
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
     assert found[~near].mean() < 0.02
@@ -92,7 +109,7 @@ def test_a_still_clip_has_none(tmp_path: Path, rng: np.random.Generator) -> None
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
     images[hand] = [0.8, 0.6, 0.5]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert not unknown_occluders(clip).any()
+    assert not unknown_occluders(clip, {}).any()
 
 
 def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -100,7 +117,7 @@ def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator)
     images = np.stack([wide[:, 12 * t : 12 * t + WIDTH] for t in range(FRAMES)])
     hand = moving_box(25, 5, 12, 12, 1)
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert not unknown_occluders(clip).any()
+    assert not unknown_occluders(clip, {}).any()
 
 
 def test_a_moving_camera_leaves_unknown_what_masks_lost(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -112,7 +129,7 @@ def test_a_moving_camera_leaves_unknown_what_masks_lost(tmp_path: Path, rng: np.
     labels[4:6] = 0
     labels[7] = np.where(thing[7], np.uint8(50), np.uint8(0))
     labels[8] = 0
-    found = unknown_occluders(painted_clip(tmp_path, to_bytes(images, rng), labels))
+    found = unknown_occluders(painted_clip(tmp_path, to_bytes(images, rng), labels), {})
     # The hand of one frame, where it may be, and not the object that covers it.
     assert found[2][hand[2]].all() and not found[2][thing[2]].any() and found[2].mean() < 0.4
     # Frames without any mask say nothing, at the clip's end either.
@@ -129,16 +146,16 @@ def test_border_pixels_of_a_mask_are_no_occluder(tmp_path: Path, rng: np.random.
     images[rim] = 0.5 * images[rim] + 0.5 * np.array([1.0, 0.0, 0.0])
     images[hand] = [1.0, 0.0, 0.0]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert unknown_occluders(clip).mean() < 0.002
+    assert unknown_occluders(clip, {}).mean() < 0.002
 
 
 def test_rows_that_are_never_background(tmp_path: Path, rng: np.random.Generator) -> None:
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
     masks = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=np.uint8)
     masks[:, 10:14] = 50
-    assert not unknown_occluders(painted_clip(tmp_path / "a", to_bytes(images, rng), masks)).any()
+    assert not unknown_occluders(painted_clip(tmp_path / "a", to_bytes(images, rng), masks), {}).any()
     masks[:] = 50
-    assert not unknown_occluders(painted_clip(tmp_path / "b", to_bytes(images, rng), masks)).any()
+    assert not unknown_occluders(painted_clip(tmp_path / "b", to_bytes(images, rng), masks), {}).any()
 
 
 def test_large_images_are_compared_smaller(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -148,8 +165,13 @@ def test_large_images_are_compared_smaller(tmp_path: Path, rng: np.random.Genera
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
     images[sleeve] = [0.1, 0.15, 0.9]
     large = to_bytes(images, rng).repeat(scale, axis=1).repeat(scale, axis=2)
-    clip = painted_clip(tmp_path, large, np.zeros(large.shape[:3], np.uint8))
-    found = unknown_occluders(clip)
+    clip = painted_clip(
+        tmp_path,
+        large,
+        np.zeros(large.shape[:3], np.uint8),
+        np.array([[700.0, 0, 280], [0, 700, 210], [0, 0, 1]]),
+    )
+    found = unknown_occluders(clip, {"right": wrist_at(6.0 * np.arange(FRAMES), 30, (1.0, 0.0))})
     assert found.shape == large.shape[:3]
     inside = sleeve.repeat(scale, axis=1).repeat(scale, axis=2)
     assert found[inside].mean() > 0.95

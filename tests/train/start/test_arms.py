@@ -1,0 +1,96 @@
+"""Arms and sleeves before a background that moves: found by place and colour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import arm_clips
+import numpy as np
+import pytest
+import scipy.ndimage
+from arm_clips import FRAMES, HEIGHT, WIDTH, K, hand_and_arm
+from toy_clips import painted_clip
+
+from bigs.train.start.arms import arm_reach, arms
+from bigs.train.start.background import unknown_occluders
+from bigs.types import Side
+
+BLUE = np.array([0.1, 0.15, 0.9])
+# At 4 mm a pixel: how far the place alone can tell an arm, from the wrist.
+CUFF_PIXELS = 0.05 / 0.004
+
+
+def street(rng: np.random.Generator) -> np.ndarray:
+    """[T, H, W, 3]: structure that passes by."""
+    wide = rng.normal(size=(HEIGHT, WIDTH + 9 * FRAMES, 3))
+    wide = scipy.ndimage.gaussian_filter(wide, (1.5, 1.5, 0))
+    wide = 0.5 + 0.2 * wide / wide.std()
+    return np.stack([wide[:, 9 * t : 9 * t + WIDTH] for t in range(FRAMES)]).clip(0, 1)
+
+
+def filmed(sleeve: np.ndarray | None, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures [T, H, W, 3] uint8 and masks of a hand whose arm has that colour, or the background's."""
+    hand, arm = hand_and_arm()
+    images = street(rng)
+    images[hand] = [0.8, 0.6, 0.5]
+    if sleeve is not None:
+        images[arm] = sleeve
+    noisy = images + rng.normal(0, 0.01, images.shape)
+    return (255 * noisy.clip(0, 1)).round().astype(np.uint8), hand
+
+
+def found_in(images: np.ndarray, hand: np.ndarray, joints: dict[Side, np.ndarray]) -> np.ndarray:
+    return arms(images, ~hand, arm_reach(joints, K, hand.shape), joints, K)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_a_sleeve_is_found_by_its_colour(rng: np.random.Generator) -> None:
+    images, hand = filmed(BLUE, rng)
+    arm = hand_and_arm()[1]
+    found = found_in(images, hand, {"right": arm_clips.joints()})
+    assert found[arm].mean() > 0.9
+    near = scipy.ndimage.binary_dilation(arm, np.ones((1, 9, 9)))
+    assert found[~near].mean() < 0.005
+    assert not found[hand].any()
+
+
+def test_a_sleeve_like_the_background_is_known_by_its_place(rng: np.random.Generator) -> None:
+    images, hand = filmed(None, rng)
+    arm = hand_and_arm()[1]
+    found = found_in(images, hand, {"right": arm_clips.joints()})
+    cuff = arm & (scipy.ndimage.distance_transform_edt(~hand) < CUFF_PIXELS)
+    assert found[cuff].all() and not found[hand].any()
+    far = scipy.ndimage.distance_transform_edt(~hand[0]) > 3 * CUFF_PIXELS
+    assert found[0][far].mean() < 0.1
+
+
+def test_without_hands_there_are_none(rng: np.random.Generator) -> None:
+    images, hand = filmed(BLUE, rng)
+    assert not found_in(images, hand, {}).any()
+
+
+def test_a_wrist_behind_the_camera_tells_nothing(rng: np.random.Generator) -> None:
+    images, hand = filmed(BLUE, rng)
+    assert not found_in(images, hand, {"right": -arm_clips.joints()}).any()
+
+
+@pytest.mark.parametrize("scale", [1, 5])
+def test_a_run_looks_for_them_where_the_camera_moves(
+    tmp_path: Path, rng: np.random.Generator, scale: int
+) -> None:
+    """Also where pictures are so large that they are compared smaller."""
+    images, hand = filmed(BLUE, rng)
+    images, labels = (
+        values.repeat(scale, axis=1).repeat(scale, axis=2)
+        for values in (images, np.where(hand, np.uint8(150), np.uint8(0)))
+    )
+    clip = painted_clip(tmp_path, images, labels, np.diag([scale, scale, 1.0]) @ K)
+    assert not unknown_occluders(clip, {}).any()
+    found = unknown_occluders(clip, {"right": arm_clips.joints()})
+    arm = hand_and_arm()[1].repeat(scale, axis=1).repeat(scale, axis=2)
+    assert found[arm].mean() > 0.9
+    assert found[~arm].mean() < 0.05
