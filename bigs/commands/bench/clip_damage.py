@@ -41,6 +41,7 @@ class ClipDamage:
     exposure: float = 0.0  # variation of the gain about 1
     outliers: float = 0.0  # share of frames with a grossly wrong estimate, drawn for each subject
     focal: float = 1.0  # factor on the stated focal length
+    brightness: float = 1.0  # factor on the pictures
 
 
 DAMAGES: dict[str, ClipDamage] = {
@@ -66,6 +67,8 @@ DAMAGES["together"] = ClipDamage(
     outliers=0.12,
     focal=1.06,
 )
+# Careful capture in bad light.
+DAMAGES["dark"] = ClipDamage("pictures 0.3 times as bright", brightness=0.3)
 
 
 def write_damaged(
@@ -88,9 +91,9 @@ def write_damaged(
     worse = _with_outliers(clip, damage.outliers, poses)
     # What estimators tell that were told a longer focal length.
     wrists = {side: hand_models[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
-    worse = with_focal_factor(worse, wrists, damage.focal)
+    worse = _dimmed(with_focal_factor(worse, wrists, damage.focal), damage.brightness)
     without, swapped = (_some(count, share, labels) for share in (damage.maskless, damage.swapped))
-    gains = _wavering(count, damage.exposure, pictures)
+    gains = damage.brightness * _wavering(count, damage.exposure, pictures)
 
     def images() -> Iterator[np.ndarray]:
         for t in range(count):
@@ -109,6 +112,14 @@ def write_damaged(
             yield np.zeros_like(found) if without[t] else found
 
     return write_build_clip(worse, folder, hand_models, worse.K, images(), masks())
+
+
+def _dimmed(clip: Clip, brightness: float) -> Clip:
+    """The clip whose object's points have the colours that darker pictures give them."""
+    track = clip.object
+    if track is None or track.colors is None:
+        return clip
+    return replace(clip, object=replace(track, colors=brightness * track.colors))
 
 
 def as_jpeg(image: np.ndarray, quality: int) -> np.ndarray:

@@ -66,7 +66,7 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarr
     reach = arm_reach(joints, K, labels.shape)
     beyond = background & ~reach
     if unknown[beyond].sum() > _MOVING_SHARE * beyond.sum():
-        unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
+        unknown = _lost(labels) | _whole(arms(images, background, unknown, reach, joints, K), background)
     else:
         unknown = _whole(unknown, background)
     if clip.arms is not None:

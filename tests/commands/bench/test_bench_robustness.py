@@ -83,6 +83,15 @@ def test_pictures_get_noise_artefacts_and_another_exposure(
     assert gains.min() < 0.9 and gains.max() > 1.1 and (np.abs(gains - 1.0) < 0.21).all()
 
 
+def test_dark_pictures_darken_the_points_of_the_object(
+    tiny: Clip, damaged: Callable[[ClipDamage], Clip]
+) -> None:
+    found = damaged(ClipDamage("", brightness=0.3))
+    for t in range(len(tiny)):
+        assert np.abs(found.image(t) - 0.3 * tiny.image(t)).max() <= 0.51
+    np.testing.assert_allclose(found.object.colors, 0.3 * tiny.object.colors, atol=0.01)
+
+
 def test_gross_outliers_are_gross_and_few(tiny: Clip, damaged: Callable[[ClipDamage], Clip]) -> None:
     found = damaged(ClipDamage("", outliers=0.12))
     turned = _turns(found.object.rotations, tiny.object.rotations)

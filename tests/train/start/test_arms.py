@@ -40,7 +40,7 @@ def filmed(sleeve: np.ndarray | None, rng: np.random.Generator) -> tuple[np.ndar
 
 
 def found_in(images: np.ndarray, hand: np.ndarray, joints: dict[Side, np.ndarray]) -> np.ndarray:
-    return arms(images, ~hand, arm_reach(joints, K, hand.shape), joints, K)
+    return arms(images, ~hand, ~hand, arm_reach(joints, K, hand.shape), joints, K)
 
 
 @pytest.fixture
