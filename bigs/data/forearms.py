@@ -18,9 +18,10 @@ from bigs.types import MASK_VALUES, Side
 
 # Every so many pixels tell.
 _STEP = 4
-# How far hands go on beyond their wrists, and how far estimates of wrists err, metres.
-_BEYOND = 0.05
-# A mask of which a larger share lies further out shows some arm. If a tenth of the frames do, all are cut.
+# How far hands go on beyond their wrists and estimates of wrists err, metres.
+_BEYOND = 0.07
+# A mask of which a larger share lies further out shows some arm. If a tenth of the frames of either hand do,
+# all of both are cut: what made them follows limbs.
 _SHARE, _PERCENTILE = 0.1, 90.0
 # Cut so far on the hand's side of its wrist, metres: of a wrong arm more harm comes than of a missing wrist.
 _MARGIN = 0.01
@@ -42,15 +43,12 @@ def without_arms(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Clip:
     cuts: dict[Side, np.ndarray] = {side: _wrist_lines(places, clip.K) for side, places in joints.items()}
     frames = range(len(clip))
     shares = np.array(side_by_side(lambda t: _arm_shares(clip.mask(t)[::_STEP, ::_STEP], cuts, t), frames))
-    with_arm = np.nanpercentile(np.vstack([shares, np.zeros(len(cuts))]), _PERCENTILE, axis=0) > _SHARE
-    arms = {side: lines for (side, lines), found in zip(cuts.items(), with_arm, strict=True) if found}
-    if not arms:
+    if not (np.nanpercentile(np.vstack([shares, np.zeros(len(cuts))]), _PERCENTILE, axis=0) > _SHARE).any():
         return clip
-    clip = replace(clip, arms=arms)
+    clip = replace(clip, arms=cuts)
     shown = side_by_side(lambda t: np.bincount(clip.mask(t).ravel(), minlength=256), frames)
-    areas = clip.mask_areas | {side: np.array(shown)[:, MASK_VALUES[side]] for side in arms}
-    whose = "those of both hands go" if len(arms) == 2 else f"that of the {next(iter(arms))} hand goes"
-    note = f"masks: {whose} on over the arm; cut at the wrist"
+    areas = clip.mask_areas | {side: np.array(shown)[:, MASK_VALUES[side]] for side in cuts}
+    note = "masks: those of hands go on over the arms; cut at the wrists"
     return replace(clip, mask_areas=areas, notes=(*clip.notes, note))
 
 

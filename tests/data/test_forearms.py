@@ -40,7 +40,7 @@ ALL = np.ones(FRAMES, dtype=bool)
 def test_arms_are_cut_off(tmp_path: Path, armed: np.ndarray) -> None:
     clip = without_arms(filmed(tmp_path, armed), {"right": arm_clips.joints()})
     hand, arm = hand_and_arm()
-    assert clip.notes == ("masks: that of the right hand goes on over the arm; cut at the wrist",)
+    assert clip.notes == ("masks: those of hands go on over the arms; cut at the wrists",)
     for t in range(FRAMES):
         labels, beyond = clip.mask(t), clip.arm(t)
         assert not labels[arm[t]].any()
@@ -108,7 +108,7 @@ def test_opening_a_clip_cuts_them_off(
     armed_clip: Path, tiny: Clip, both_hands: Mapping[Side, HandModel]
 ) -> None:
     clip = open_clip(armed_clip, both_hands)
-    assert any(note.endswith("over the arm; cut at the wrist") for note in clip.notes)
+    assert any(note.endswith("over the arms; cut at the wrists") for note in clip.notes)
     pairs = [(np.isin(tiny.mask(t), (150, 250)), np.isin(clip.mask(t), (150, 250))) for t in range(len(clip))]
     hands, now = (np.stack(masks) for masks in zip(*pairs, strict=True))
     # Of hands that the object hides but for their wrists little is left.
