@@ -21,6 +21,7 @@ from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
 from bigs.train.start.arms import arm_reach, arms
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
+from bigs.train.start.shake import SteadyView, steady_view
 from bigs.types import MASK_VALUES, Side
 
 # Colours (in [0, 1]) that differ by more than this belong to different surfaces; noise and soft shadows
@@ -48,30 +49,52 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarr
         joints: [T, 21, 3] of each hand in camera space, as estimated.
 
     Returns:
-        [T, H, W] bool at the clip's size. When the background does not stand still, only arms and what masks
-        lost.
+        [T, H, W] bool at the clip's size. When the background does not stand still, nor turns as before a
+        camera that shakes, only arms and what masks lost.
     """
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
     images = np.stack(side_by_side(lambda t: clip.image(t)[::step, ::step], frames))
     labels = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames))
     background = labels == 0
-    still = _still_background(_looks(images, background))
-    # A frame at a time: the whole clip in floats is large.
-    unknown = (
-        np.stack([(np.abs(_floats(image) - still) > _THRESHOLD).any(axis=-1) for image in images])
-        & background
-    )
     K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
     reach = arm_reach(joints, K, labels.shape)
-    beyond = background & ~reach
-    if unknown[beyond].sum() > _MOVING_SHARE * beyond.sum():
-        unknown = _lost(labels) | _whole(arms(images, background, unknown, reach, joints, K), background)
+    differs = _differing(images, background)
+    if _moves(differs, background, reach):
+        differs = _differing_before(steady_view(images, background, K), images, background)
+    if _moves(differs, background, reach):
+        unknown = _lost(labels) | _whole(arms(images, background, differs, reach, joints, K), background)
     else:
-        unknown = _whole(unknown, background)
+        unknown = _whole(differs, background)
     if clip.arms is not None:
         unknown |= np.stack(side_by_side(lambda t: clip.arm(t)[::step, ::step], frames))
     return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+
+
+def _differing(images: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Where the background [T, H, W] of images [T, H, W, 3] is not what stands still: bool."""
+    still = _still_background(_looks(images, background))
+    # A frame at a time: the whole clip in floats is large.
+    return background & np.stack([_unlike(_floats(image), still) for image in images])
+
+
+def _differing_before(view: SteadyView, images: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """The same where the camera turns."""
+    still = _still_background(_looks(view.gathered(images), view.gathered(background)))
+    size = images.shape[1:3]
+    found = [_unlike(_floats(image), view.shown_in(t, still, size)) for t, image in enumerate(images)]
+    return background & np.stack(found)
+
+
+def _unlike(colors: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Where colours [H, W, 3] are not the background's; nowhere where that is not a number."""
+    return (np.abs(colors - still) > _THRESHOLD).any(axis=-1)
+
+
+def _moves(differs: np.ndarray, background: np.ndarray, reach: np.ndarray) -> bool:
+    """Whether the background moves: whether much of it differs beyond the reach of arms."""
+    beyond = background & ~reach
+    return bool(differs[beyond].sum() > _MOVING_SHARE * beyond.sum())
 
 
 def _whole(unknown: np.ndarray, background: np.ndarray) -> np.ndarray:
