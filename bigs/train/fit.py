@@ -138,7 +138,9 @@ def fit(
             wrists = {side: hand_models[side].rest_wrist(track.betas) for side, track in clip.hands.items()}
             clip = with_focal_factor(clip, wrists, motion.focal)
         watch.begin("start values")
-    unknown = occluders.result()
+    unknown, moving = occluders.result()
+    if moving:
+        report.facts["background"] = moving
     targets = TargetSource(clip, unknown)
     targets.make_ahead(_image_sizes(config.stages))
     start = build_scene(

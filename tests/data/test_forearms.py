@@ -80,7 +80,7 @@ def test_what_is_cut_off_may_hide_things(tmp_path: Path) -> None:
     """Whether or not the background tells."""
     clip = without_arms(filmed(tmp_path, ALL), {"right": arm_clips.joints()})
     arm = hand_and_arm()[1]
-    assert unknown_occluders(clip, {})[arm].all()
+    assert unknown_occluders(clip, {}).pixels[arm].all()
 
 
 @pytest.fixture(scope="module")

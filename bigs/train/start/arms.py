@@ -1,9 +1,8 @@
 """Arms and sleeves before a background that moves.
 
 An arm hides a hand's wrist, and masks call it background. Where that stands still, an arm is what differs.
-Otherwise three things are known: an arm goes on from the wrist; it has the same few colours in all frames,
-which the background has no more often near a wrist than elsewhere; and it still differs from what a pixel
-usually shows, which says the less the more of the background does so, too.
+Otherwise two things are known: an arm goes on from the wrist, and it has the same few colours in all frames,
+which the background has no more often near a wrist than elsewhere.
 """
 
 from __future__ import annotations
@@ -19,11 +18,9 @@ from bigs.types import Side
 # far. Estimates of wrists err, elbows and sleeves are wide.
 _CUFF_RADIUS, _CUFF_LENGTH = 0.05, 0.06
 _ARM_RADIUS, _ARM_LENGTH = 0.08, 0.35
-# What is so many times as likely where an arm may be as elsewhere is an arm.
+# Colours that are so many times as frequent near wrists as elsewhere are those of arms.
 _TIMES = 2.0
-# The share of arms that look like what their pixels usually show.
-_UNSEEN = 0.05
-# If less of what is near a wrist is an arm by that, it cannot be told from the background.
+# If less of what is near a wrist has such colours, they do not tell the arm from the background.
 _LEAST_SHARE = 0.2
 # A colour that was never seen counts as if this share of all pixels had it.
 _NEVER = 1e-4
@@ -48,7 +45,6 @@ def arm_reach(joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int
 def arms(
     images: np.ndarray,
     background: np.ndarray,
-    differs: np.ndarray,
     reach: np.ndarray,
     joints: Mapping[Side, np.ndarray],
     K: np.ndarray,
@@ -58,26 +54,21 @@ def arms(
     Args:
         images: [T, H, W, 3] uint8.
         background: [T, H, W] bool, what no mask claims.
-        differs: [T, H, W] bool, part of it: what does not look as its pixel usually does.
         reach: [T, H, W] bool, of `arm_reach`.
         joints, K: as there.
 
     Returns:
-        [T, H, W] bool, part of the background. Where nothing tells an arm, all of its cuff.
+        [T, H, W] bool, part of the background. Where colours do not tell an arm, all of its cuff.
     """
     cuffs = [
         background & _beyond(places, K, background.shape, _CUFF_RADIUS, _CUFF_LENGTH)
         for places in joints.values()
     ]
     near = np.logical_or.reduce(cuffs) if cuffs else np.zeros_like(background)
-    beyond = background & ~reach
-    moves = np.clip(differs[beyond].sum() / max(beyond.sum(), 1), _UNSEEN, 1.0 - _UNSEEN)
-    odds = _log_ratio(images, near, beyond)
-    odds += np.where(differs, np.log((1.0 - _UNSEEN) / moves), np.log(_UNSEEN / (1.0 - moves)))
-    likely = odds > np.log(_TIMES)
-    found = reach & background & likely
+    colored = _log_ratio(images, near, background & ~reach) > np.log(_TIMES)
+    found = reach & background & colored
     for cuff in cuffs:
-        if likely[cuff].sum() < _LEAST_SHARE * cuff.sum():
+        if colored[cuff].sum() < _LEAST_SHARE * cuff.sum():
             found |= cuff
     return found
 

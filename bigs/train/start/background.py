@@ -41,7 +41,14 @@ _CLOSE = 5
 _MOVING_SHARE = 0.05
 
 
-def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarray:
+class Occluders(NamedTuple):
+    """What may hide hands and object without a label."""
+
+    pixels: np.ndarray  # [T, H, W] bool at the clip's size
+    moving: str | None  # how the background moves before which they were found; None: it stands still
+
+
+def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluders:
     """Where an unlabelled occluder may hide a hand or the object.
 
     Args:
@@ -49,8 +56,8 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarr
         joints: [T, 21, 3] of each hand in camera space, as estimated.
 
     Returns:
-        [T, H, W] bool at the clip's size. When the background does not stand still, nor turns as before a
-        camera that shakes, only arms and what masks lost.
+        Before a background that neither stands still nor turns as the camera does, only arms and what masks
+        lost.
     """
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
@@ -59,16 +66,19 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> np.ndarr
     background = labels == 0
     K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
     reach = arm_reach(joints, K, labels.shape)
-    differs = _differing(images, background)
+    differs, moving = _differing(images, background), None
     if _moves(differs, background, reach):
+        moving = "turns, as the camera does"
         differs = _differing_before(steady_view(images, background, K), images, background)
     if _moves(differs, background, reach):
-        unknown = _lost(labels) | _whole(arms(images, background, differs, reach, joints, K), background)
+        moving = "moves, so that what hides hands is known only where arms may be"
+        unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
     else:
         unknown = _whole(differs, background)
     if clip.arms is not None:
         unknown |= np.stack(side_by_side(lambda t: clip.arm(t)[::step, ::step], frames))
-    return unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+    whole = unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]
+    return Occluders(whole, moving)
 
 
 def _differing(images: np.ndarray, background: np.ndarray) -> np.ndarray:

@@ -170,7 +170,7 @@ def test_too_few_gaussians_become_more_and_show_the_clip_better(
     for densify in (None, FEW):
         config = object_plan(40, 100, densify)
         scene, report = fit(tiny, both_hands, config)
-        source = EvidenceSource(TargetSource(tiny, unknown_occluders(tiny, {})), scene, config, None)
+        source = EvidenceSource(TargetSource(tiny, unknown_occluders(tiny, {}).pixels), scene, config, None)
         evidence = source.evidence(config.stages[0])
         error = image_error(scene, evidence, ("object",), torch.arange(len(tiny)))
         found[densify] = count(scene), error, report.facts.get("object Gaussians")

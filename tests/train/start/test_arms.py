@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import arm_clips
@@ -9,8 +10,13 @@ import numpy as np
 import pytest
 import scipy.ndimage
 from arm_clips import FRAMES, HEIGHT, WIDTH, K, hand_and_arm
+from PIL import Image
 from toy_clips import painted_clip
 
+from bigs.data.base import Clip
+from bigs.hand import HandModel
+from bigs.train.fit import fit
+from bigs.train.plan.presets import SMOKE
 from bigs.train.start.arms import arm_reach, arms
 from bigs.train.start.background import unknown_occluders
 from bigs.types import Side
@@ -40,7 +46,7 @@ def filmed(sleeve: np.ndarray | None, rng: np.random.Generator) -> tuple[np.ndar
 
 
 def found_in(images: np.ndarray, hand: np.ndarray, joints: dict[Side, np.ndarray]) -> np.ndarray:
-    return arms(images, ~hand, ~hand, arm_reach(joints, K, hand.shape), joints, K)
+    return arms(images, ~hand, arm_reach(joints, K, hand.shape), joints, K)
 
 
 @pytest.fixture
@@ -89,8 +95,22 @@ def test_a_run_looks_for_them_where_the_camera_moves(
         for values in (images, np.where(hand, np.uint8(150), np.uint8(0)))
     )
     clip = painted_clip(tmp_path, images, labels, np.diag([scale, scale, 1.0]) @ K)
-    assert not unknown_occluders(clip, {}).any()
-    found = unknown_occluders(clip, {"right": arm_clips.joints()})
+    assert not unknown_occluders(clip, {}).pixels.any()
+    found, moving = unknown_occluders(clip, {"right": arm_clips.joints()})
+    assert moving is not None and moving.startswith("moves")
     arm = hand_and_arm()[1].repeat(scale, axis=1).repeat(scale, axis=2)
     assert found[arm].mean() > 0.9
     assert found[~arm].mean() < 0.05
+
+
+def test_the_report_says_that_the_background_moves(
+    tiny: Clip, both_hands: dict[Side, HandModel], tmp_path: Path, rng: np.random.Generator
+) -> None:
+    plan = replace(SMOKE, stages=())
+    assert "background" not in fit(tiny, both_hands, plan)[1].facts
+    paths = tuple(tmp_path / path.name for path in tiny.image_paths)
+    for t, path in enumerate(paths):
+        noise = rng.integers(0, 256, (tiny.height, tiny.width, 3), dtype=np.uint8)
+        Image.fromarray(np.where(tiny.mask(t)[..., None] == 0, noise, tiny.image(t))).save(path)
+    report = fit(replace(tiny, image_paths=paths), both_hands, plan)[1]
+    assert report.facts["background"].startswith("moves")

@@ -55,7 +55,7 @@ def test_finds_a_moving_sleeve(tmp_path: Path, rng: np.random.Generator) -> None
     images[hand] = [0.8, 0.6, 0.5]
     images[sleeve] = [0.1, 0.15, 0.9]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    found = unknown_occluders(clip, {"right": wrist_at(11 + 5 * np.arange(FRAMES), 37, (0.0, 1.0))})
+    found = unknown_occluders(clip, {"right": wrist_at(11 + 5 * np.arange(FRAMES), 37, (0.0, 1.0))}).pixels
     assert found.shape == (FRAMES, HEIGHT, WIDTH) and found.dtype == bool
     assert found[sleeve].mean() > 0.95
     assert not found[hand].any()
@@ -72,7 +72,7 @@ def test_exposure_that_wavers_hides_no_background(tmp_path: Path, rng: np.random
     clip = painted_clip(tmp_path, to_bytes(gains * images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
     found = unknown_occluders(
         with_one_exposure(clip), {"right": wrist_at(11 + 5 * np.arange(FRAMES), 37, (0.0, 1.0))}
-    )
+    ).pixels
     assert found[sleeve].mean() > 0.95
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 7, 7)))
     assert found[~near].mean() < 0.01
@@ -98,7 +98,7 @@ def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator) -> 
             "right": wrist_at(np.full(FRAMES, 8.0), 28, (1.0, 0.0)),
             "left": wrist_at(4.0 * np.arange(FRAMES), 51, (1.0, 0.0)),
         },
-    )
+    ).pixels
     assert found[sleeve].mean() > 0.95
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
     assert found[~near].mean() < 0.02
@@ -109,7 +109,8 @@ def test_a_still_clip_has_none(tmp_path: Path, rng: np.random.Generator) -> None
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
     images[hand] = [0.8, 0.6, 0.5]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert not unknown_occluders(clip, {}).any()
+    found = unknown_occluders(clip, {})
+    assert found.moving is None and not found.pixels.any()
 
 
 def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -117,7 +118,7 @@ def test_a_moving_camera_tells_nothing(tmp_path: Path, rng: np.random.Generator)
     images = np.stack([wide[:, 12 * t : 12 * t + WIDTH] for t in range(FRAMES)])
     hand = moving_box(25, 5, 12, 12, 1)
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert not unknown_occluders(clip, {}).any()
+    assert not unknown_occluders(clip, {}).pixels.any()
 
 
 def test_a_moving_camera_leaves_unknown_what_masks_lost(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -129,7 +130,7 @@ def test_a_moving_camera_leaves_unknown_what_masks_lost(tmp_path: Path, rng: np.
     labels[4:6] = 0
     labels[7] = np.where(thing[7], np.uint8(50), np.uint8(0))
     labels[8] = 0
-    found = unknown_occluders(painted_clip(tmp_path, to_bytes(images, rng), labels), {})
+    found = unknown_occluders(painted_clip(tmp_path, to_bytes(images, rng), labels), {}).pixels
     # The hand of one frame, where it may be, and not the object that covers it.
     assert found[2][hand[2]].all() and not found[2][thing[2]].any() and found[2].mean() < 0.4
     # Frames without any mask say nothing, at the clip's end either.
@@ -146,16 +147,16 @@ def test_border_pixels_of_a_mask_are_no_occluder(tmp_path: Path, rng: np.random.
     images[rim] = 0.5 * images[rim] + 0.5 * np.array([1.0, 0.0, 0.0])
     images[hand] = [1.0, 0.0, 0.0]
     clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
-    assert unknown_occluders(clip, {}).mean() < 0.002
+    assert unknown_occluders(clip, {}).pixels.mean() < 0.002
 
 
 def test_rows_that_are_never_background(tmp_path: Path, rng: np.random.Generator) -> None:
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
     masks = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=np.uint8)
     masks[:, 10:14] = 50
-    assert not unknown_occluders(painted_clip(tmp_path / "a", to_bytes(images, rng), masks), {}).any()
+    assert not unknown_occluders(painted_clip(tmp_path / "a", to_bytes(images, rng), masks), {}).pixels.any()
     masks[:] = 50
-    assert not unknown_occluders(painted_clip(tmp_path / "b", to_bytes(images, rng), masks), {}).any()
+    assert not unknown_occluders(painted_clip(tmp_path / "b", to_bytes(images, rng), masks), {}).pixels.any()
 
 
 def test_large_images_are_compared_smaller(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -171,7 +172,7 @@ def test_large_images_are_compared_smaller(tmp_path: Path, rng: np.random.Genera
         np.zeros(large.shape[:3], np.uint8),
         np.array([[700.0, 0, 280], [0, 700, 210], [0, 0, 1]]),
     )
-    found = unknown_occluders(clip, {"right": wrist_at(6.0 * np.arange(FRAMES), 30, (1.0, 0.0))})
+    found = unknown_occluders(clip, {"right": wrist_at(6.0 * np.arange(FRAMES), 30, (1.0, 0.0))}).pixels
     assert found.shape == large.shape[:3]
     inside = sleeve.repeat(scale, axis=1).repeat(scale, axis=2)
     assert found[inside].mean() > 0.95
