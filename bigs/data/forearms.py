@@ -27,8 +27,8 @@ _SHARE, _PERCENTILE = 0.1, 90.0
 _MARGIN = 0.01
 # Estimates that differ from most of so many frames around them are wrong.
 _AROUND = 5
-# Index of the middle finger's first joint.
-_KNUCKLE = 4
+# Index of the middle finger's first joint, from which a line through the wrist goes on along the arm.
+KNUCKLE = 4
 
 
 def without_arms(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Clip:
@@ -54,7 +54,7 @@ def without_arms(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Clip:
 
 def _wrist_lines(joints: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Lines [T, 3] across wrists: pixel (x, y) lies a x + b y + c metres beyond where masks are cut."""
-    steady = scipy.ndimage.median_filter(joints[:, [0, _KNUCKLE]], (_AROUND, 1, 1), mode="nearest")
+    steady = scipy.ndimage.median_filter(joints[:, [0, KNUCKLE]], (_AROUND, 1, 1), mode="nearest")
     pixels = steady @ K.T
     pixels = pixels[..., :2] / np.maximum(pixels[..., 2:], 1e-6)
     away = pixels[:, 0] - pixels[:, 1]

@@ -17,9 +17,9 @@ from bigs.commands.clips.convert import ConvertPlan, convert
 from bigs.commands.clips.open import open_clip
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.data.forearms import without_arms
+from bigs.data.forearms import KNUCKLE, without_arms
 from bigs.data.images import read_mask
-from bigs.hand import HandModel
+from bigs.hand import JOINT_NAMES, HandModel
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import MASK_VALUES, Side
@@ -34,6 +34,10 @@ def filmed(folder: Path, armed: np.ndarray) -> Clip:
 
 
 ALL = np.ones(FRAMES, dtype=bool)
+
+
+def test_lines_start_at_the_middle_finger() -> None:
+    assert JOINT_NAMES[KNUCKLE] == "middle1"
 
 
 @pytest.mark.parametrize("armed", [ALL, np.arange(FRAMES) % 4 == 0], ids=["all frames", "some frames"])
@@ -66,6 +70,13 @@ def test_a_wrong_estimate_cuts_no_hand(tmp_path: Path) -> None:
 def test_frames_without_a_hand_say_nothing(tmp_path: Path) -> None:
     clip = filmed(tmp_path, ALL)
     assert without_arms(clip, {"left": arm_clips.joints()}) is clip
+
+
+def test_both_masks_are_cut_where_one_shows_an_arm(tmp_path: Path) -> None:
+    clip = filmed(tmp_path, ALL)
+    elsewhere = arm_clips.joints() - [0.0, 0.1, 0.0]
+    cut = without_arms(clip, {"right": arm_clips.joints(), "left": elsewhere})
+    assert cut.arms is not None and set(cut.arms) == {"right", "left"}
 
 
 def test_parts_of_a_clip_are_cut_the_same(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bigs.data.forearms import KNUCKLE
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
 from bigs.types import Side
 
@@ -24,8 +25,6 @@ _TIMES = 2.0
 _LEAST_SHARE = 0.2
 # A colour that was never seen counts as if this share of all pixels had it.
 _NEVER = 1e-4
-# Index of the middle finger's first joint.
-_KNUCKLE = 4
 
 
 def arm_reach(joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -81,7 +80,7 @@ def _beyond(
     rows, columns = np.ogrid[: shape[1], : shape[2]]
     x, y = columns + 0.5, rows + 0.5
     wrist = joints[:, 0]
-    away = wrist - joints[:, _KNUCKLE]
+    away = wrist - joints[:, KNUCKLE]
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
     for t, (start, end) in enumerate(zip(wrist, wrist + length * away, strict=True)):
         if min(start[2], end[2]) <= radius:
