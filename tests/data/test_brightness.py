@@ -16,11 +16,11 @@ from bigs.data.exposure import with_one_exposure
 FRAMES, HEIGHT, WIDTH = 4, 40, 60
 
 
-def filmed(folder: Path, brightness: float, subject: float = 0.9, room: float = 0.6) -> Clip:
+def filmed(folder: Path, brightness: float, subject: float = 0.9, room: float = 0.6, size: int = 15) -> Clip:
     """A hand and an object whose brightest channel is `subject` before a room, all times `brightness`."""
     images = np.random.default_rng(0).uniform(0.1, room, (FRAMES, HEIGHT, WIDTH, 3))
     labels = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=np.uint8)
-    labels[:, 10:30, 10:25], labels[:, 10:30, 25:40] = 150, 50
+    labels[:, 12 : 12 + size, 25 - size : 25], labels[:, 12 : 12 + size, 25 : 25 + size] = 150, 50
     images[labels > 0] *= 0.5
     images[labels > 0, 0] = subject
     clip = painted_clip(folder, (255.0 * brightness * images).round().astype(np.uint8), labels)
@@ -53,7 +53,8 @@ def test_black_things_in_good_light_stay_black(tmp_path: Path) -> None:
 
 
 def test_bright_things_in_a_dark_room_are_not_cut_off(tmp_path: Path) -> None:
-    clip = filmed(tmp_path, 1.0, subject=0.9, room=0.11)
+    """However small they are."""
+    clip = filmed(tmp_path, 1.0, subject=0.9, room=0.11, size=2)
     assert brightened(clip) is clip
 
 
@@ -65,14 +66,14 @@ def test_pictures_that_show_nothing_stay_black(tmp_path: Path) -> None:
 def test_exposure_is_found_in_the_dark(tmp_path: Path) -> None:
     """Its levels count for pictures as bright as usual; files stay as dark as they are."""
     rng = np.random.default_rng(1)
-    room = np.kron(rng.uniform(0.3, 0.7, (10, 15, 1)), np.ones((8, 8, 3)))
+    room = np.kron(rng.uniform(0.2, 0.5, (10, 15, 1)), np.ones((8, 8, 3)))
     gains = np.array([1.0, 1.0, 0.8, 1.2, 1.0])
     labels = np.zeros((len(gains), 80, 120), dtype=np.uint8)
     labels[:, 20:50, 20:50] = 150
     images = 0.15 * gains[:, None, None, None] * np.where(labels[..., None] > 0, 0.8, room)
     clip = with_one_exposure(painted_clip(tmp_path, (255.0 * images).round().astype(np.uint8), labels))
     assert clip.gains is not None and clip.brightness == 1.0
-    np.testing.assert_allclose(clip.gains, np.repeat(gains[:, None], 3, axis=1), atol=0.04)
+    np.testing.assert_allclose(clip.gains, np.repeat(gains[:, None], 3, axis=1), atol=0.06)
     shown = brightened(clip)
     assert np.ptp([shown.image(t)[60:].mean() for t in range(len(gains))]) < 6.0
-    assert shown.image(0)[60:].mean() > 100.0 > 30.0 > clip.image(0)[60:].mean()
+    assert shown.image(0)[60:].mean() > 80.0 > 20.0 > clip.image(0)[60:].mean()

@@ -90,9 +90,12 @@ def test_what_lies_beyond_the_picture_is_not_known(rng: np.random.Generator) -> 
     assert np.isnan(turned.shown_in(0, np.ones(view.shape), (HEIGHT, WIDTH))).any()
 
 
-def test_a_run_finds_sleeves_before_a_camera_that_sways(tmp_path: Path, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("degrees", [0.5, 3.0])
+def test_a_run_finds_sleeves_before_a_camera_that_sways(
+    tmp_path: Path, rng: np.random.Generator, degrees: float
+) -> None:
     """Wherever they are: no joints say where an arm may be."""
-    images, hand, sleeve = filmed(swaying(3.0), rng)
+    images, hand, sleeve = filmed(swaying(degrees), rng)
     clip = painted_clip(tmp_path, images, np.where(hand, np.uint8(150), np.uint8(0)), K)
     found, moving = unknown_occluders(clip, {})
     assert moving == "turns, as the camera does"
