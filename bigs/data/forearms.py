@@ -24,7 +24,7 @@ _BEYOND = 0.07
 # all of both are cut: what made them follows limbs.
 _SHARE, _PERCENTILE = 0.1, 90.0
 # Cut so far on the hand's side of its wrist, metres: of a wrong arm more harm comes than of a missing wrist.
-_MARGIN = 0.01
+_MARGIN = 0.02
 # Estimates that differ from most of so many frames around them are wrong.
 _AROUND = 5
 # Index of the middle finger's first joint, from which a line through the wrist goes on along the arm.

@@ -48,7 +48,7 @@ def test_arms_are_cut_off(tmp_path: Path, armed: np.ndarray) -> None:
     for t in range(FRAMES):
         labels, beyond = clip.mask(t), clip.arm(t)
         assert not labels[arm[t]].any()
-        assert (labels[hand[t]] == 150).mean() > 0.9  # all but the margin at the wrist
+        assert (labels[hand[t]] == 150).mean() > 0.8  # all but the margin at the wrist
         assert beyond[arm[t]].all() == armed[t]
         assert ((labels == 150) | beyond == (hand[t] | (arm[t] & armed[t]))).all()
         assert clip.mask_areas["right"][t] == (labels == 150).sum() > 0

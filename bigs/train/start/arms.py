@@ -82,8 +82,11 @@ def _beyond(
     wrist = joints[:, 0]
     away = wrist - joints[:, KNUCKLE]
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
-    for t, (start, end) in enumerate(zip(wrist, wrist + length * away, strict=True)):
-        if min(start[2], end[2]) <= radius:
+    # An arm may go on past the camera, and is seen as far as it lies before it.
+    ahead = (wrist[:, 2] - radius) / np.maximum(-away[:, 2], 1e-6)
+    ends = wrist + np.where(away[:, 2] < 0.0, np.clip(ahead, 0.0, length), length)[:, None] * away
+    for t, (start, end) in enumerate(zip(wrist, ends, strict=True)):
+        if start[2] <= radius:
             continue
         (x0, y0), (x1, y1) = ((K @ point)[:2] / point[2] for point in (start, end))
         along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / max((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6)

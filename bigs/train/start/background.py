@@ -3,8 +3,9 @@
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
 background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
 most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
-colours, the one that the clip's occluders have elsewhere belongs to an occluder. Before a background that
-moves only arms are looked for (see `arms`), and masks that were lost: what they showed may still be there.
+colours, the one that the clip's occluders have elsewhere belongs to an occluder. A camera that shakes is held
+still first (see `shake`). Before a background that moves otherwise only arms are looked for (see `arms`), and
+masks that were lost: what they showed may still be there.
 """
 
 from __future__ import annotations

@@ -79,6 +79,27 @@ def test_without_hands_there_are_none(rng: np.random.Generator) -> None:
     assert not found_in(images, hand, {}).any()
 
 
+def test_things_of_the_same_colour_elsewhere_are_none(rng: np.random.Generator) -> None:
+    images, hand = filmed(BLUE, rng)
+    images[:, 5:12, 5:12] = (255 * BLUE).astype(np.uint8)
+    assert not found_in(images, hand, {"right": arm_clips.joints()})[:, :15, :15].any()
+
+
+def test_an_arm_that_comes_from_the_camera_is_seen_before_it() -> None:
+    """As of a camera on the head: the wrist is 30 cm away, the elbow behind the camera."""
+    joints = np.tile([0.0, 0.02, 0.3], (FRAMES, 21, 1))
+    joints[:, 4] += [0.0, -0.03, 0.08]  # away from the camera and up, so that the arm comes from below
+    reach = arm_reach({"right": joints}, K, (FRAMES, HEIGHT, WIDTH))
+    assert reach[:, -1, WIDTH // 2].all() and reach[:, HEIGHT // 2 + 10, WIDTH // 2].all()
+    assert not reach[:, 0].any()
+
+
+def test_a_wrist_at_the_camera_tells_nothing() -> None:
+    joints = np.tile([0.0, 0.0, 0.01], (FRAMES, 21, 1))
+    joints[:, 4, 2] += 0.08
+    assert not arm_reach({"right": joints}, K, (FRAMES, HEIGHT, WIDTH)).any()
+
+
 def test_a_wrist_behind_the_camera_tells_nothing(rng: np.random.Generator) -> None:
     images, hand = filmed(BLUE, rng)
     assert not found_in(images, hand, {"right": -arm_clips.joints()}).any()

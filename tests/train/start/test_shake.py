@@ -27,7 +27,9 @@ def swaying(degrees: float) -> np.ndarray:
     return Rotation.from_rotvec(np.radians(degrees) * angles).as_matrix()
 
 
-def filmed(turns: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def filmed(
+    turns: np.ndarray, rng: np.random.Generator, tall: int = 13
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pictures [T, H, W, 3] of a wall, with a hand that a mask shows and a sleeve that none does; both."""
     wall = scipy.ndimage.gaussian_filter(rng.normal(size=(2 * HEIGHT, 2 * WIDTH, 3)), (4, 4, 0))
     wall = 0.5 + 0.15 * wall / wall.std()
@@ -39,7 +41,7 @@ def filmed(turns: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.
         at = [there[..., 1] / there[..., 2] - 0.5, there[..., 0] / there[..., 2] - 0.5]
         image = np.stack([scipy.ndimage.map_coordinates(wall[..., c], at, order=1) for c in range(3)], -1)
         hand[t, 30:50, 20 + 5 * t : 40 + 5 * t] = True
-        sleeve[t, 50:63, 24 + 5 * t : 36 + 5 * t] = True
+        sleeve[t, 50 : 50 + tall, 24 + 5 * t : 36 + 5 * t] = True
         image[hand[t]], image[sleeve[t]] = [0.8, 0.6, 0.5], [0.1, 0.2, 0.8]
         images.append(image + rng.normal(0, 0.005, image.shape))
     return (255 * np.stack(images).clip(0, 1)).round().astype(np.uint8), hand, sleeve
@@ -54,7 +56,7 @@ def rng() -> np.random.Generator:
 def test_turns_are_found_to_a_fraction_of_a_pixel(rng: np.random.Generator, degrees: float) -> None:
     """With a sleeve in the background that goes its own way."""
     true = swaying(degrees)
-    images, hand, _ = filmed(true, rng)
+    images, hand, _ = filmed(true, rng, tall=40)
     found = camera_turns(images, ~hand, K)
     errors = Rotation.from_matrix(found.transpose(0, 2, 1) @ true).magnitude() * K[0, 0]
     assert errors.max() < 0.3
