@@ -90,7 +90,9 @@ class Clip:
     # Lines [T, 3] across the wrists of hands whose masks go on over the arm (see `forearms`).
     arms: Mapping[Side, np.ndarray] | None = None
     gains: np.ndarray | None = None  # [T, 3] how many times as bright as usual the files' channels are
-    brightness: float = 1.0  # of the files, as a share of what `image` shows (see `bigs.data.brightness`)
+    brightness: float = (
+        1.0  # of the files, as a share of what `image` shows (see `bigs.data.oddities.brightness`)
+    )
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from bigs.checks import InputError
+from bigs.geometry.spread import spread
 
 # Sides of a crop relative to the object's box; a step draws one, so that size is not learned.
 ZOOMS = (1.1, 1.6)
@@ -42,8 +43,7 @@ def choose_frames(where: str, areas: np.ndarray, most: int) -> list[int]:
             f"{where}: masks: expected a frame with at least {_LEAST_PIXELS} pixels of the object, "
             f"found at most {int(areas.max(initial=0))}"
         )
-    picks = np.linspace(0, len(shown) - 1, min(most, len(shown))).round().astype(int)
-    return [int(frame) for frame in shown[picks]]
+    return [int(frame) for frame in shown[spread(len(shown), most)]]
 
 
 def cut_crop(image: np.ndarray, mask: np.ndarray, size: int) -> Crop:

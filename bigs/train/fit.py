@@ -11,8 +11,8 @@ import torch
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
-from bigs.data.brightness import brightened
 from bigs.data.focal import with_focal_factor
+from bigs.data.oddities.brightness import brightened
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import HandModel
 from bigs.losses.perceptual import VggWeights

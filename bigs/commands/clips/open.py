@@ -7,12 +7,12 @@ from pathlib import Path
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
-from bigs.data.exposure import with_one_exposure
-from bigs.data.forearms import without_arms
 from bigs.data.formats.layouts import load_clip
-from bigs.data.pace import with_pace
-from bigs.data.plausible import plausible
-from bigs.data.swapped_labels import with_labels_sorted
+from bigs.data.oddities.exposure import with_one_exposure
+from bigs.data.oddities.forearms import without_arms
+from bigs.data.oddities.pace import with_pace
+from bigs.data.oddities.plausible import plausible
+from bigs.data.oddities.swapped_labels import with_labels_sorted
 from bigs.hand import HandModel
 from bigs.train.start.initial import initial_trajectory
 from bigs.types import Side

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from bigs.data.base import Clip
 from bigs.data.images import read_image
+from bigs.geometry.spread import spread
 from bigs.hand import HandModel
 from bigs.hand.model import MANO_PARENTS
 from bigs.preprocess.hands.tracks import joints_of_track
@@ -40,7 +41,7 @@ def write_sheet(
     file: Path, images: Sequence[Path], names: Sequence[str], draw: Callable[[int, np.ndarray], np.ndarray]
 ) -> None:
     """A sheet of frames spread over the clip, each as `draw` makes it from its number and its pixels."""
-    chosen = np.unique(np.linspace(0, len(images) - 1, _COLUMNS * _ROWS).round().astype(int))
+    chosen = spread(len(images), _COLUMNS * _ROWS)
     rows: list[Image.Image] = []
     for start in range(0, len(chosen), _COLUMNS):
         frames = chosen[start : start + _COLUMNS]

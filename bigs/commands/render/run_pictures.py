@@ -14,6 +14,7 @@ from bigs.checks import InputError
 from bigs.commands.folder.contents import PREVIEW_PICTURE, PREVIEW_VIDEO, REPORT
 from bigs.commands.render.frame import orbit_camera, render_frame, render_input_view
 from bigs.data.base import Clip
+from bigs.geometry.spread import spread
 from bigs.metrics.picture import ALL_METRICS
 from bigs.models.playback import Playback
 from bigs.threads import beside
@@ -97,7 +98,7 @@ def write_run_report(out: Path, clip: Clip, playback: Playback, drawn: Drawn, to
 
 
 def _sheet(clip: Clip, playback: Playback) -> Image.Image:
-    frames = [int(t) for t in np.linspace(0, len(clip) - 1, min(len(clip), 6)).round()]
+    frames = spread(len(clip), 6).tolist()
     rows: dict[str, list[np.ndarray]] = {"input": [], "render": [], "overlay": [], "turned 40°": []}
     for t in frames:
         color, alpha = render_input_view(playback, t)
@@ -109,7 +110,7 @@ def _sheet(clip: Clip, playback: Playback) -> Image.Image:
 
 def _strips(clip: Clip, playback: Playback, kept: list[tuple[str, Image.Image]]) -> Iterator[np.ndarray]:
     """Input, render and novel view side by side, frame by frame; smaller ones of some are added to `kept`."""
-    wanted = set(np.linspace(0, len(clip) - 1, min(len(clip), _SLIDER_FRAMES)).round().astype(int).tolist())
+    wanted = set(spread(len(clip), _SLIDER_FRAMES).tolist())
     for t in range(len(clip)):
         parts = (clip.image(t), render_input_view(playback, t)[0], _novel_view(playback, t))
         strip = np.concatenate([to_bytes(part) for part in parts], axis=1)

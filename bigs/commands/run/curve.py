@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bigs.commands.evaluate.picture_scores import frame_scores, means
 from bigs.commands.folder.contents import write_json
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt, excerpt_trajectory
+from bigs.geometry.spread import spread
 from bigs.metrics.report import evaluate
 from bigs.models.playback import record
 from bigs.models.scene import Scene
@@ -42,7 +41,7 @@ class Curve:
         self, clip: Clip, truth: HandObjectTrajectory | None, profile: Profile, every: float, place: Path
     ) -> None:
         count = len(clip)
-        self._frames = np.unique(np.linspace(0, count - 1, min(count, _FRAMES)).round().astype(int))
+        self._frames = spread(count, _FRAMES)
         self._clip = clip
         self._few = excerpt(clip, self._frames)
         self._truth = None if truth is None else excerpt_trajectory(truth, self._frames)

@@ -9,6 +9,7 @@ import numpy as np
 
 from bigs.geometry.coverage import ObjectViews
 from bigs.geometry.normals import outward_normals
+from bigs.geometry.spread import spread
 from bigs.geometry.surface import (
     DistanceGrid,
     VisualHull,
@@ -60,7 +61,7 @@ def sights(
         config: see there.
     """
     usable = np.flatnonzero(confidence > 0) if (confidence > 0).any() else np.arange(len(masks))
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, config.frames).round().astype(int))]
+    chosen = usable[spread(len(usable), config.frames)]
     silhouettes = [
         silhouette_around_points(masks[t] != 0, points @ rotations[t].T + transl[t], K) for t in chosen
     ]

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bigs.data.forearms import KNUCKLE
+from bigs.data.oddities.forearms import KNUCKLE
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
 from bigs.types import Side
 

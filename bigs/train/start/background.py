@@ -17,7 +17,7 @@ import numpy as np
 import scipy.ndimage
 
 from bigs.data.base import Clip
-from bigs.data.exposure import median_over_time
+from bigs.data.oddities.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
 from bigs.train.start.arms import arm_reach, arms

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.geometry.spread import spread
 from bigs.types import MASK_VALUES
 
 # So many frames, evenly over the clip, tell; and only the darkest and brightest colours are kept off the ends
@@ -16,11 +17,10 @@ _MARGIN = 0.02
 def hand_color(clip: Clip) -> tuple[float, float, float] | None:
     """The median of the pixels labelled as either hand, RGB in (0, 1); None if there is none.
 
-    Where colours start matters for poses: steps that fit a pale hand to pictures of a dark one move it out of
-    sight before its colour has followed.
+    Until a hand's colour has followed the pictures, steps that compare colours pull at its pose.
     """
     labels = [MASK_VALUES[side] for side in clip.hands]
-    frames = np.unique(np.linspace(0, len(clip) - 1, _FRAMES).round().astype(int))
+    frames = spread(len(clip), _FRAMES)
     pixels = np.concatenate([clip.image(t)[np.isin(clip.mask(t), labels)] for t in frames])
     if len(pixels) == 0:
         return None

@@ -9,7 +9,7 @@ import pytest
 import scipy.ndimage
 from toy_clips import painted_clip
 
-from bigs.data.exposure import with_one_exposure
+from bigs.data.oddities.exposure import with_one_exposure
 from bigs.train.start.background import unknown_occluders
 
 FRAMES, HEIGHT, WIDTH = 9, 60, 80

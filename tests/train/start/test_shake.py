@@ -10,6 +10,7 @@ import scipy.ndimage
 from scipy.spatial.transform import Rotation
 from toy_clips import painted_clip
 
+from bigs.train.start import shake
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.shake import camera_turns, steady_view
 
@@ -104,3 +105,13 @@ def test_a_run_finds_sleeves_before_a_camera_that_sways(
     assert found[sleeve].mean() > 0.9
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
     assert found[~near].mean() < 0.02
+
+
+def test_turns_that_cannot_be_make_no_endless_picture(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images, hand, _ = filmed(swaying(0.0), rng)
+    monkeypatch.setattr(shake, "camera_turns", lambda *_: swaying(100.0))
+    view = steady_view(images, ~hand, K)
+    assert view.shape[0] <= 3 * HEIGHT and view.shape[1] <= 3 * WIDTH
+    assert view.gathered(images).shape == (FRAMES, *view.shape, 3)

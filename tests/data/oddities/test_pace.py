@@ -12,9 +12,9 @@ from PIL import Image
 from toy_clips import painted_clip
 
 from bigs.commands.clips.open import open_clip
-from bigs.data import pace
 from bigs.data.base import Clip
-from bigs.data.pace import with_pace
+from bigs.data.oddities import pace
+from bigs.data.oddities.pace import with_pace
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, Entity, Side
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from bigs.data.base import Clip
+from bigs.geometry.spread import spread
 from bigs.threads import side_by_side
 from bigs.types import MASK_VALUES
 
@@ -38,7 +39,7 @@ def brightened(clip: Clip) -> Clip:
 
 def _level(clip: Clip) -> float:
     """How bright a clip's pictures are, in [0, 1]."""
-    frames = np.unique(np.linspace(0, len(clip) - 1, _FRAMES).round().astype(int)).tolist()
+    frames = spread(len(clip), _FRAMES).tolist()
     brightest = np.stack(side_by_side(lambda t: clip.image(t)[::_STEP, ::_STEP].max(-1), frames))
     labels = np.stack(side_by_side(lambda t: clip.mask(t)[::_STEP, ::_STEP], frames))
     shown = brightest[np.isin(labels, list(MASK_VALUES.values()))]

@@ -10,8 +10,8 @@ import pytest
 from toy_clips import painted_clip
 
 from bigs.data.base import Clip
-from bigs.data.brightness import brightened
-from bigs.data.exposure import with_one_exposure
+from bigs.data.oddities.brightness import brightened
+from bigs.data.oddities.exposure import with_one_exposure
 
 FRAMES, HEIGHT, WIDTH = 4, 40, 60
 

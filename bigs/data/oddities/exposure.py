@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from bigs.data.base import Clip
-from bigs.data.brightness import brightened
+from bigs.data.oddities.brightness import brightened
 from bigs.threads import side_by_side
 
 # Long side in pixels at which frames are compared, and the sides of the cells whose means are compared: noise

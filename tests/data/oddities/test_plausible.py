@@ -11,7 +11,7 @@ import pytest
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
-from bigs.data.plausible import plausible
+from bigs.data.oddities.plausible import plausible
 from bigs.hand import HandModel
 from bigs.types import Side
 

@@ -13,7 +13,7 @@ from PIL import Image
 from bigs.commands.clips.open import open_clip
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.data.swapped_labels import with_labels_sorted
+from bigs.data.oddities.swapped_labels import with_labels_sorted
 from bigs.hand import HandModel
 from bigs.types import MASK_VALUES, Side
 

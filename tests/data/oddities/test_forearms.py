@@ -17,8 +17,8 @@ from bigs.commands.clips.convert import ConvertPlan, convert
 from bigs.commands.clips.open import open_clip
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.data.forearms import KNUCKLE, without_arms
 from bigs.data.images import read_mask
+from bigs.data.oddities.forearms import KNUCKLE, without_arms
 from bigs.hand import JOINT_NAMES, HandModel
 from bigs.train.start.background import unknown_occluders
 from bigs.train.start.initial import initial_trajectory

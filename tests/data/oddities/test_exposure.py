@@ -12,7 +12,7 @@ from toy_clips import painted_clip
 
 from bigs.data.base import Clip
 from bigs.data.excerpt import excerpt
-from bigs.data.exposure import with_one_exposure
+from bigs.data.oddities.exposure import with_one_exposure
 
 FRAMES, HEIGHT, WIDTH = 12, 90, 120
 

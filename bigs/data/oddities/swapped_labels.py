@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bigs.data.base import Clip
-from bigs.data.plausible import frames_in_words
+from bigs.data.oddities.plausible import frames_in_words
 from bigs.threads import side_by_side
 from bigs.types import MASK_VALUES, SIDES, Side
 
