@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
 from bigs.fused.touch import Touch
+from bigs.geometry.spread import spread
 from bigs.guidance.denoiser import Denoiser
 from bigs.losses.perceptual import VggWeights
 from bigs.models.canonical import CanonicalHand, CanonicalObject
@@ -238,7 +239,7 @@ class Step:
 
 def spread_frames(n_frames: int, most: int) -> Tensor:
     """At most so many frames of a clip, evenly spread."""
-    return torch.linspace(0, n_frames - 1, min(most, n_frames)).round().long()
+    return torch.from_numpy(spread(n_frames, most))
 
 
 def _at(values: Tensor, frames: Tensor) -> Tensor:
