@@ -56,12 +56,12 @@ def rasterize(
                 f"settings.{name}: expected gsplat's constant {defaults[name]} for backend 'gsplat', "
                 f"found {getattr(settings, name)}"
             )
-    backgrounds = tensors.get("backgrounds")
+    backgrounds = tensors.get("backgrounds") if "RGB" in render_mode else None
     colors, alphas, info = gsplat.rasterization(
         **{name: tensor for name, tensor in tensors.items() if name != "backgrounds"},
         width=width,
         height=height,
-        backgrounds=backgrounds,
+        backgrounds=None if packed else backgrounds,
         near_plane=settings.near_plane,
         far_plane=settings.far_plane,
         radius_clip=settings.radius_clip,
@@ -74,11 +74,14 @@ def rasterize(
         packed=packed,
         absgrad=absgrad,
     )
+    behind = torch.zeros_like(colors[..., :1, :1, :])
+    if backgrounds is not None:
+        depth = colors.shape[-1] - backgrounds.shape[-1]
+        behind = torch.nn.functional.pad(backgrounds, (0, depth))[..., None, None, :]
+        if packed:  # gsplat 1.5 packs without backgrounds only
+            colors = colors + (1.0 - alphas) * behind
     if pixel_mask is not None:
         inside = pixel_mask[..., None]
-        behind = torch.zeros_like(colors[..., :1, :1, :])
-        if backgrounds is not None and "RGB" in render_mode:
-            behind[..., : backgrounds.shape[-1]] = backgrounds.detach()[..., None, None, :]
-        colors = torch.where(inside, colors, behind)
+        colors = torch.where(inside, colors, behind.detach())
         alphas = torch.where(inside, alphas, torch.zeros_like(alphas))
     return colors, alphas, info

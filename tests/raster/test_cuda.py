@@ -23,14 +23,15 @@ class FakeGsplat:
     def __init__(self):
         self.layout = None
 
-    def rasterization(self, *, rasterize_mode, packed, absgrad, **call):
+    def rasterization(self, *, rasterize_mode, packed, absgrad, backgrounds, **call):
         self.layout = packed, absgrad
+        assert backgrounds is None or not packed  # gsplat 1.5 expects one colour for all cameras there
         rules = ("near_plane", "far_plane", "radius_clip", "eps2d", "tile_size")
         settings = RasterSettings(
             **{name: call.pop(name) for name in rules},
             antialiased=rasterize_mode == "antialiased",
         )
-        return rasterization(**call, settings=settings, backend="torch")
+        return rasterization(**call, backgrounds=backgrounds, settings=settings, backend="torch")
 
 
 @pytest.fixture
@@ -72,8 +73,12 @@ def test_gsplat_receives_the_call(fake, ortho, degree, antialiased):
 def test_gsplat_receives_the_layout(fake, means2d, absgrad):
     if absgrad and means2d == "values":
         return
-    rasterization(**scene(), means2d=means2d, absgrad=absgrad, backend="gsplat")
+    through = rasterization(
+        **scene(), means2d=means2d, absgrad=absgrad, render_mode="RGB+D", backend="gsplat"
+    )
+    direct = rasterization(**scene(), render_mode="RGB+D", backend="torch")
     assert fake.layout == (means2d == "packed", absgrad)
+    assert relative(through.colors, direct.colors) < 1e-12
 
 
 @pytest.mark.parametrize("name", ["max_alpha", "alpha_threshold", "min_transmittance", "exp_degree"])
@@ -131,6 +136,8 @@ def test_cuda_agrees_with_rust(degree, ortho, options):
 def test_drop_in_is_gsplat_on_cuda(packed):
     gsplat = pytest.importorskip("gsplat")
     inputs = on("cuda", scene(n=200, cameras=2, dtype=torch.float32))
-    ours, theirs = (call(**inputs, packed=packed) for call in (drop_in.rasterization, gsplat.rasterization))
+    ours = drop_in.rasterization(**inputs, packed=packed)
+    theirs = gsplat.rasterization(**inputs, packed=False)
     assert relative(ours[0], theirs[0]) < 1e-6
-    assert ours[2]["means2d"].shape == theirs[2]["means2d"].shape
+    without = {name: value for name, value in inputs.items() if name != "backgrounds"}
+    assert ours[2]["means2d"].shape == gsplat.rasterization(**without, packed=packed)[2]["means2d"].shape
