@@ -90,9 +90,9 @@ class Clip:
     # Lines [T, 3] across the wrists of hands whose masks go on over the arm (see `forearms`).
     arms: Mapping[Side, np.ndarray] | None = None
     gains: np.ndarray | None = None  # [T, 3] how many times as bright as usual the files' channels are
-    brightness: float = (
-        1.0  # of the files, as a share of what `image` shows (see `bigs.data.oddities.brightness`)
-    )
+    # The files show black + brightness * what `image` does, in [0, 1] (see `bigs.data.oddities.brightness`).
+    black: float = 0.0
+    brightness: float = 1.0
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
 
     def __post_init__(self) -> None:
@@ -104,11 +104,20 @@ class Clip:
     def image(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB, in the clip's usual exposure."""
         gain = np.ones(3) if self.gains is None else self.gains[t]
-        return _divided(self._pinhole_image(t), gain * self.brightness)
+        return self._shown(t, gain)
 
     def image_as_taken(self, t: int) -> np.ndarray:
         """Frame `t`, [H, W, 3] uint8 RGB, in its own exposure."""
-        return _divided(self._pinhole_image(t), np.full(3, self.brightness))
+        return self._shown(t, np.ones(3))
+
+    def _shown(self, t: int, gain: np.ndarray) -> np.ndarray:
+        """Frame `t` as if it had been taken with a gain [3] of one, and with the usual black and white."""
+        image = self._pinhole_image(t)
+        if (gain == 1.0).all() and (self.black, self.brightness) == (0.0, 1.0):
+            return image
+        levels = (np.arange(256)[:, None] / gain - 255.0 * self.black) / self.brightness
+        table = levels.round().clip(0, 255).astype(np.uint8)
+        return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)
 
     def _pinhole_image(self, t: int) -> np.ndarray:
         if self.optics is None:
@@ -148,11 +157,3 @@ def beyond_line(line: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     rows, columns = np.ogrid[: shape[0], : shape[1]]
     a, b, c = line
     return a * (columns + 0.5) + b * (rows + 0.5) + c > 0.0
-
-
-def _divided(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """An image [H, W, 3] uint8 with its channels divided by a gain [3]."""
-    if (gain == 1.0).all():
-        return image
-    table = (np.arange(256)[:, None] / gain).round().clip(0, 255).astype(np.uint8)
-    return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)

@@ -111,6 +111,7 @@ class Playback:
     hands: dict[Side, HandPlayback]
     object: ObjectPlayback | None
     fps: float = USUAL_FPS  # frames a second
+    black: float = 0.0  # what the clip's files have for black; `splats` hold what is added to it
 
     def __post_init__(self) -> None:
         check_name("the scene's name", self.name)
@@ -132,10 +133,10 @@ class Playback:
     def canonical(self, entity: Entity) -> Gaussians:
         """An entity's Gaussians [N, ...] before posing: a hand's in its shaped rest pose (right-handed)."""
         if entity == "object":
-            splats = self.object.splats
-            return Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.colors)
-        splats = self.hands[entity].splats
-        return Gaussians(splats.points, splats.quats, splats.scales, splats.opacities, splats.colors)
+            splats, means = self.object.splats, self.object.splats.means
+        else:
+            splats, means = self.hands[entity].splats, self.hands[entity].splats.points
+        return Gaussians(means, splats.quats, splats.scales, splats.opacities, splats.colors + self.black)
 
     def gaussians(self, frames: Iterable[int], entities: Iterable[Entity] | None = None) -> Gaussians:
         """Gaussians of some frames in their camera's space: means [B, N, 3], quats [B, N, 4], lit colours.
@@ -145,7 +146,8 @@ class Playback:
         """
         index = self._index(frames)
         chosen = self.entities if entities is None else entities
-        return pose_parts((self._part(entity, index) for entity in chosen), self.light)
+        posed = pose_parts((self._part(entity, index) for entity in chosen), self.light)
+        return posed._replace(colors=posed.colors + self.black)
 
     def at(self, frames: Iterable[int]) -> Playback:
         """Some frames as a playback of their own.
@@ -296,4 +298,5 @@ def record(
         hands,
         obj,
         fps,
+        scene.black,
     )

@@ -62,6 +62,7 @@ def save_playback(path: Path, playback: Playback) -> None:
         "size": [playback.width, playback.height],
         "normalize_shift": playback.normalize_shift,
         "fps": playback.fps,
+        "black": playback.black,
     }
     facts = {"format": FORMAT, **facts}
     # A single key, since the writer's order of keys differs from run to run.
@@ -99,6 +100,7 @@ def load_playback(path: Path) -> Playback:
         )
     # What earlier versions did not store.
     facts.setdefault("fps", USUAL_FPS)
+    facts.setdefault("black", 0.0)
     if facts["format"] == _UNSUMMED:
         tensors |= _without_grasps(tensors)
     if facts["format"] != FORMAT:
@@ -184,6 +186,8 @@ def _check_facts(where: str, facts: Mapping[str, Any]) -> None:
         raise InputError(f"{where}: normalize_shift: expected three numbers, found {shown(shift)}")
     if not _is_finite(facts["fps"]) or facts["fps"] <= 0.0:
         raise InputError(f"{where}: fps: expected a positive number, found {shown(facts['fps'])}")
+    if not _is_finite(facts["black"]) or not 0.0 <= facts["black"] < 1.0:
+        raise InputError(f"{where}: black: expected a number from 0 to 1, found {shown(facts['black'])}")
 
 
 def _is_pixels(value: Any) -> bool:
@@ -292,4 +296,5 @@ def _assemble(metadata: dict[str, Any], tensors: dict[str, Tensor]) -> Playback:
         hands,
         obj,
         metadata["fps"],
+        metadata["black"],
     )

@@ -92,8 +92,8 @@ class Scene(nn.Module):
         self.register_buffer("surface_faces", None if object_surface is None else object_surface.faces)
         self.object_distance = object_distance
         self.lighting = lighting
-        # Of the clip's files, as a share of the pictures to which the scene is fitted.
-        self.brightness = 1.0
+        # The clip's files show black + brightness * what the scene is fitted to.
+        self.black, self.brightness = 0.0, 1.0
 
     @property
     def object_surface(self) -> ObjectSurface | None:

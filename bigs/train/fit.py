@@ -127,7 +127,9 @@ def fit(
     watch.begin("start values")
     clip = brightened(clip)
     if clip.brightness < 1.0:
-        report.facts["pictures"] = f"dark; fitted as if {1.0 / clip.brightness:.1f} times as bright"
+        times = f"{1.0 / clip.brightness:.1f} times"
+        dark, pale = f"dark; fitted as if {times} as bright", f"pale; fitted with {times} the contrast"
+        report.facts["pictures"] = dark if clip.black == 0.0 else pale
     # Few of the tracker's operations are parallel, so there is a core to spare beside it.
     occluders = beside().submit(unknown_occluders, clip, initial_trajectory(clip, hand_models).joints)
     motion = None
@@ -155,7 +157,7 @@ def fit(
         motion,
     )
     scene = start.scene
-    scene.brightness = clip.brightness
+    scene.black, scene.brightness = clip.black, clip.brightness
     gaussians = 0 if scene.object_splats is None else len(scene.object_splats.base_points)
     report.skipped += start.skipped
     report.seconds = watch.read()

@@ -51,13 +51,16 @@ def test_a_recording_shows_what_the_scene_shows(pair) -> None:
 
 
 @torch.no_grad()
-def test_a_recording_is_as_dark_as_the_clip() -> None:
+def test_a_recording_is_as_dark_and_as_pale_as_the_clip() -> None:
     scene = make_scene(rich=True)
-    bright = record(scene, "clip", NAMES, SHIFT).gaussians([1])
-    scene.brightness = 0.3
-    dark = record(scene, "clip", NAMES, SHIFT).gaussians([1])
-    torch.testing.assert_close(dark.colors, 0.3 * bright.colors)
-    assert torch.equal(dark.means, bright.means) and torch.equal(dark.opacities, bright.opacities)
+    usual = record(scene, "clip", NAMES, SHIFT)
+    scene.black, scene.brightness = 0.2, 0.3
+    pale = record(scene, "clip", NAMES, SHIFT)
+    shown = [(usual.gaussians([1]), pale.gaussians([1]))]
+    shown += [(usual.canonical(entity), pale.canonical(entity)) for entity in scene.entities]
+    for before, after in shown:
+        torch.testing.assert_close(after.colors, 0.2 + 0.3 * before.colors)
+        assert torch.equal(after.means, before.means) and torch.equal(after.opacities, before.opacities)
 
 
 @torch.no_grad()

@@ -52,6 +52,14 @@ def test_a_forged_scene_that_fits_is_read(forge: Callable[..., Path]) -> None:
     assert load_playback(forge({"name": "other"})).name == "other"
 
 
+def test_the_black_of_pale_pictures(whole: Path, forge: Callable[..., Path], tmp_path: Path) -> None:
+    save_playback(tmp_path / "pale.safetensors", replace(load_playback(whole), black=0.25))
+    assert load_playback(tmp_path / "pale.safetensors").black == 0.25
+    for black in (-0.1, 1.0, float("nan"), "0.2", False, None):
+        with pytest.raises(InputError, match="black: expected a number from 0 to 1"):
+            load_playback(forge({"black": black}))
+
+
 def test_frames_a_second(whole: Path, forge: Callable[..., Path], tmp_path: Path) -> None:
     slow = replace(load_playback(whole), fps=12.5)
     save_playback(tmp_path / "slow.safetensors", slow)
@@ -61,14 +69,15 @@ def test_frames_a_second(whole: Path, forge: Callable[..., Path], tmp_path: Path
             load_playback(forge({"fps": fps}))
 
 
-def test_a_scene_of_before_there_were_frames_a_second(whole: Path, tmp_path: Path) -> None:
+def test_a_scene_of_before_there_were_frames_a_second_and_black(whole: Path, tmp_path: Path) -> None:
     with safe_open(whole, framework="pt") as file:
         facts = json.loads(file.metadata()["bigs"])
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    del facts["fps"], facts["checksum"]
+    del facts["fps"], facts["black"], facts["checksum"]
     facts["checksum"] = checksum(json.dumps(facts), tensors)
     save_file(tensors, tmp_path / "scene.safetensors", {"bigs": json.dumps(facts)})
-    assert load_playback(tmp_path / "scene.safetensors").fps == 30.0
+    found = load_playback(tmp_path / "scene.safetensors")
+    assert (found.fps, found.black) == (30.0, 0.0)
 
 
 def test_any_changed_byte_is_told(whole: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from taken_apart import Given, place_true_object
 
@@ -185,3 +186,22 @@ def test_a_step_without_its_source_says_what_to_give(given: Given, tmp_path: Pat
             preprocess(request, (step,))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"frames\.json: expected what an earlier step writes"):
         preprocess(PreprocessRequest(clip=tmp_path / "other"), ("masks",))
+
+
+@pytest.mark.parametrize(
+    ("shown", "stride", "note"),
+    [(2, 1, "--stride 2 skips those"), (2, 2, ""), (9, 3, "--stride 9 skips those"), (1, 1, "")],
+)
+def test_repeated_pictures_are_told(tmp_path: Path, shown: int, stride: int, note: str) -> None:
+    """Each picture is shown so many times, and one of every stride is kept."""
+    (tmp_path / "pictures").mkdir()
+    pictures = np.random.default_rng(0).integers(0, 255, (60, 24, 32, 3), dtype=np.uint8)
+    for t in range(60):
+        Image.fromarray(pictures[t // shown]).save(tmp_path / "pictures" / f"{t:04d}.png")
+    request = PreprocessRequest(
+        clip=tmp_path / "clip",
+        source=tmp_path / "pictures",
+        frames=FrameConfig(stride=stride, camera=CameraRequest(focal=40.0)),
+    )
+    (outcome,) = preprocess(request, ("frames",))
+    assert len(outcome.notes) == bool(note) and all(note in found for found in outcome.notes)

@@ -12,6 +12,7 @@ from bigs.data.oddities.exposure import with_one_exposure
 from bigs.data.oddities.forearms import without_arms
 from bigs.data.oddities.pace import with_pace
 from bigs.data.oddities.plausible import plausible
+from bigs.data.oddities.repeats import with_repeats_noted
 from bigs.data.oddities.swapped_labels import with_labels_sorted
 from bigs.hand import HandModel
 from bigs.train.start.initial import initial_trajectory
@@ -31,7 +32,7 @@ def open_clip(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:
         return clip
     joints = initial_trajectory(clip, hand_models).joints
     clip = without_arms(with_labels_sorted(clip, joints), joints)
-    return with_pace(with_one_exposure(clip))
+    return with_repeats_noted(with_pace(with_one_exposure(clip)))
 
 
 def open_estimates(path: Path, hand_models: Mapping[Side, HandModel]) -> Clip:

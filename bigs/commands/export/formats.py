@@ -25,7 +25,7 @@ from bigs.export.splat_glb import save_splat_glb
 from bigs.export.spz import save_spz
 from bigs.geometry.rotations import matrix_to_axis_angle
 from bigs.hand import JOINT_NAMES, MANO_PARENTS, mirror_axis_angle, mirror_points, mirror_rotation
-from bigs.models.playback import HandPlayback, ObjectPlayback, Playback
+from bigs.models.playback import Playback
 from bigs.models.playback_file import save_playback
 from bigs.models.repose import wrist_of
 from bigs.types import Entity, Gaussians, Side
@@ -170,11 +170,7 @@ def _write_hand_meshes(folder: Path, playback: Playback, choice: Choice) -> Iter
 
 
 def _write_obj(folder: Path, playback: Playback, choice: Choice) -> Iterable[Path]:
-    colors: dict[str, np.ndarray] = {
-        side: _hand_colors(side, hand).numpy() for side, hand in playback.hands.items()
-    }
-    if playback.object is not None:
-        colors["object"] = _object_colors(playback.object).numpy()
+    colors: dict[str, np.ndarray] = {entity: _vertex_colors(playback, entity) for entity in playback.entities}
     for frame in _frames(playback, choice):
         path = _ready(folder / "meshes" / f"frame_{frame:04d}.obj")
         save_meshes(path, _meshes(playback, frame), colors)
@@ -188,13 +184,13 @@ def _write_rig(folder: Path, playback: Playback, choice: Choice) -> Iterable[Pat
         obj = RigidMesh(
             verts=o.verts.numpy(),
             faces=o.faces.numpy(),
-            colors=_object_colors(o).numpy(),
+            colors=_vertex_colors(playback, "object"),
             rotations=o.rotations.numpy(),
             transl=o.centers.numpy(),
             scale=float(o.scale),
         )
     path = _ready(folder / "scene.glb")
-    hands = {side: _rigged(side, hand) for side, hand in playback.hands.items()}
+    hands = {side: _rigged(playback, side) for side in playback.hands}
     K, width, height = playback.K.numpy(), playback.width, playback.height
     save_rig(path, hands, obj, K=K, width=width, height=height, fps=playback.fps)
     yield path
@@ -253,8 +249,9 @@ def _poses(playback: Playback) -> ClipPoses:
     return ClipPoses(playback.frame_names, playback.K.numpy(), hands, obj)
 
 
-def _rigged(side: Side, hand: HandPlayback) -> SkinnedHand:
+def _rigged(playback: Playback, side: Side) -> SkinnedHand:
     """A hand on its own side: what is stored of the canonical hand is mirrored for a left one."""
+    hand = playback.hands[side]
     orient, wrist = wrist_of(hand)
     rotations, rest_joints = torch.cat([orient[:, None], hand.hand_pose], dim=1), hand.rest_joints
     if side == "left":
@@ -267,7 +264,7 @@ def _rigged(side: Side, hand: HandPlayback) -> SkinnedHand:
     return SkinnedHand(
         verts=hand.v_posed.numpy(),
         faces=hand.faces.numpy(),
-        colors=_hand_colors(side, hand).numpy(),
+        colors=_vertex_colors(playback, side),
         lbs_weights=hand.lbs_weights.numpy(),
         rest_joints=rest_joints.numpy(),
         parents=MANO_PARENTS,
@@ -277,17 +274,17 @@ def _rigged(side: Side, hand: HandPlayback) -> SkinnedHand:
     )
 
 
-def _hand_colors(side: Side, hand: HandPlayback) -> Tensor:
-    """The colours of a hand's vertices, [V, 3], without the light of any frame."""
-    canonical = hand.v_posed if hand.v_posed.ndim == 2 else hand.v_posed.mean(0)
-    if side == "left":
-        canonical = mirror_points(canonical)
-    return _surface_colors(canonical, hand.splats.points, hand.splats.colors)
-
-
-def _object_colors(obj: ObjectPlayback) -> Tensor:
-    """The colours of the object's vertices, [V, 3], without the light of any frame."""
-    return _surface_colors(obj.verts, obj.splats.means, obj.splats.colors)
+def _vertex_colors(playback: Playback, entity: Entity) -> np.ndarray:
+    """The colours of an entity's vertices, [V, 3], without the light of any frame."""
+    if entity == "object":
+        assert playback.object is not None
+        verts = playback.object.verts
+    else:
+        v_posed = playback.hands[entity].v_posed
+        verts = v_posed if v_posed.ndim == 2 else v_posed.mean(0)
+        verts = mirror_points(verts) if entity == "left" else verts
+    canonical = playback.canonical(entity)
+    return _surface_colors(verts, canonical.means, canonical.colors).numpy()
 
 
 def _surface_colors(verts: Tensor, means: Tensor, colors: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from bigs.commands.preprocess.request import PreprocessRequest, StepOutcome, kep
 from bigs.data.base import HandTrack
 from bigs.data.formats.hold import load_hold
 from bigs.data.images import read_image, read_mask
+from bigs.data.oddities.repeats import every_new
 from bigs.hand import HandModel, load_hand_models
 from bigs.preprocess.artefacts import (
     ALIGNED_FILE,
@@ -73,11 +74,18 @@ def frames_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:
         frame_paths(processed, frames)
         return kept("frames", state, _frames_summary(frames), picture)
     frames = extract_frames(source, processed, request.frames, inputs, listen)
-    write_sheet(picture, frame_paths(processed, frames), frames.names, lambda t, image: image)
-    notes = (
-        () if frames.focal_known else (f"camera {frames.camera}: give --K, --focal or --colmap if you can",)
-    )
-    return StepOutcome("frames", "made", _frames_summary(frames), notes, picture)
+    paths = frame_paths(processed, frames)
+    write_sheet(picture, paths, frames.names, lambda t, image: image)
+    notes = []
+    if not frames.focal_known:
+        notes.append(f"camera {frames.camera}: give --K, --focal or --colmap if you can")
+    every = every_new(lambda t: read_image(paths[t]), len(paths))
+    if every > 1:
+        stride = every * request.frames.stride
+        notes.append(
+            f"of {every} pictures in a row one is new, the rest repeat it: --stride {stride} skips those"
+        )
+    return StepOutcome("frames", "made", _frames_summary(frames), tuple(notes), picture)
 
 
 def masks_step(request: PreprocessRequest, listen: Listen) -> StepOutcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +125,9 @@ def test_the_animated_hands_are_coloured_like_their_gaussians(playback: Playback
     np.testing.assert_allclose(linear, wanted, atol=0.05)
 
 
-def test_obj(playback: Playback, tmp_path: Path) -> None:
+@pytest.mark.parametrize("black", [0.0, 0.2])
+def test_obj(playback: Playback, tmp_path: Path, black: float) -> None:
+    playback = replace(playback, black=black)
     (path,) = write_format(tmp_path, playback, "obj")
     middle, trajectory = len(playback) // 2, playback.trajectory()
     assert path.name == f"frame_{middle:04d}.obj"
@@ -139,7 +142,8 @@ def test_obj(playback: Playback, tmp_path: Path) -> None:
     splats = playback.object.splats
     shown = colors[-len(playback.object.verts) :]
     distance = torch.cdist(playback.object.verts, splats.means)
-    near = splats.colors[distance.topk(4, largest=False).indices].mean(1).clamp(0, 1).numpy()
+    colored = black + splats.colors[distance.topk(4, largest=False).indices].mean(1)
+    near = colored.clamp(0, 1).numpy()
     assert np.abs(shown - near).max() < 0.01 and shown.std(0).max() > 0.05
     skin = colors[: -len(playback.object.verts)]
     assert (skin[:, 0] > skin[:, 2] + 0.1).mean() > 0.9

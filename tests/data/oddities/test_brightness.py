@@ -1,4 +1,4 @@
-"""Dark pictures are shown as bright as usual; others stay as they are."""
+"""Dark and pale pictures are shown as usual; others stay as they are."""
 
 from __future__ import annotations
 
@@ -16,16 +16,26 @@ from bigs.data.oddities.exposure import with_one_exposure
 FRAMES, HEIGHT, WIDTH = 4, 40, 60
 
 
-def filmed(folder: Path, brightness: float, subject: float = 0.9, room: float = 0.6, size: int = 15) -> Clip:
+def filmed(
+    folder: Path,
+    brightness: float,
+    *,
+    black: float = 0.0,
+    subject: float = 0.9,
+    room: float = 0.6,
+    size: int = 15,
+    darkest: float = 0.0,
+) -> Clip:
     """A hand and an object whose brightest channel is `subject` before a room, all times `brightness`."""
-    images = np.random.default_rng(0).uniform(0.1, room, (FRAMES, HEIGHT, WIDTH, 3))
+    images = np.random.default_rng(0).uniform(darkest, room, (FRAMES, HEIGHT, WIDTH, 3))
     labels = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=np.uint8)
     labels[:, 12 : 12 + size, 25 - size : 25], labels[:, 12 : 12 + size, 25 : 25 + size] = 150, 50
     images[labels > 0] *= 0.5
     images[labels > 0, 0] = subject
-    clip = painted_clip(folder, (255.0 * brightness * images).round().astype(np.uint8), labels)
+    files = 255.0 * (black + brightness * images)
+    clip = painted_clip(folder, files.round().astype(np.uint8), labels)
     assert clip.object is not None
-    colors = np.array([[0.9, 0.4, 0.2], [0.1, 0.2, 0.3]]) * brightness
+    colors = black + np.array([[0.9, 0.4, 0.2], [0.1, 0.2, 0.3]]) * brightness
     return replace(clip, object=replace(clip.object, points=np.eye(3)[:2], colors=colors))
 
 
@@ -40,6 +50,33 @@ def test_dark_pictures_look_as_in_good_light(tmp_path: Path, brightness: float) 
             assert np.abs(image.astype(float) - well_lit.image(t)).max() < 0.6 * steps + 0.02 * 255
     assert shown.object is not None and well_lit.object is not None
     np.testing.assert_allclose(shown.object.colors, well_lit.object.colors, rtol=0.02)
+
+
+@pytest.mark.parametrize(("black", "brightness"), [(0.2, 0.6), (0.45, 0.4), (0.2, 0.15)])
+def test_pale_pictures_look_as_in_clear_air(tmp_path: Path, black: float, brightness: float) -> None:
+    clear, pale = filmed(tmp_path / "clear", 1.0), filmed(tmp_path / "pale", brightness, black=black)
+    shown = brightened(pale)
+    assert shown.black == pytest.approx(black, abs=0.01)
+    assert shown.brightness == pytest.approx(brightness, rel=0.05)
+    for t in range(FRAMES):
+        for image in (shown.image(t), shown.image_as_taken(t)):
+            assert np.abs(image.astype(float) - clear.image(t)).max() < 0.6 / brightness + 0.05 * 255
+    assert shown.object is not None and clear.object is not None
+    np.testing.assert_allclose(shown.object.colors, clear.object.colors, atol=0.04)
+
+
+def test_frames_of_another_exposure_have_another_black(tmp_path: Path) -> None:
+    clip = replace(filmed(tmp_path, 0.5, black=0.2), black=0.2, brightness=0.5)
+    brighter = np.tile([1.1, 1.2, 1.0], (FRAMES, 1))
+    files = clip._pinhole_image(0) / 255.0
+    expected = 255.0 * (files / brighter[0] - 0.2) / 0.5
+    np.testing.assert_allclose(replace(clip, gains=brighter).image(0), expected.clip(0, 255), atol=0.51)
+
+
+def test_without_black_things_a_clip_is_not_pale(tmp_path: Path) -> None:
+    """Its range is wide enough as it is."""
+    clip = filmed(tmp_path, 1.0, darkest=0.25, subject=1.0, room=1.0)
+    assert brightened(clip) is clip
 
 
 def test_of_a_bright_clip_nothing_changes(tmp_path: Path) -> None:
