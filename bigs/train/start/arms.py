@@ -19,6 +19,12 @@ from bigs.types import Side
 # far. Estimates of wrists err, elbows and sleeves are wide.
 _CUFF_RADIUS, _CUFF_LENGTH = 0.05, 0.06
 _ARM_RADIUS, _ARM_LENGTH = 0.08, 0.35
+# All that is so near the line through a forearm is arm, ...
+_SURE_RADIUS = 0.02
+# ... if in the median frame more than this share of it differs from the background. Without an arm none does.
+_SLEEVED = 0.15
+# An arm has a colour if this percentage of its pixels have one that is rarer on it.
+_RARE = 10.0
 # Colours that are so many times as frequent near wrists as elsewhere are those of arms.
 _TIMES = 2.0
 # If less of what is near a wrist has such colours, they do not tell the arm from the background.
@@ -69,6 +75,37 @@ def arms(
     for cuff in cuffs:
         if colored[cuff].sum() < _LEAST_SHARE * cuff.sum():
             found |= cuff
+    return found
+
+
+def cuffs_like_background(
+    images: np.ndarray,
+    differs: np.ndarray,
+    background: np.ndarray,
+    joints: Mapping[Side, np.ndarray],
+    K: np.ndarray,
+) -> np.ndarray:
+    """Where arms and sleeves hide wrists although they have the colour of the background behind them.
+
+    Args:
+        images: [T, H, W, 3] uint8.
+        differs: [T, H, W] bool, what of the background is not as usual.
+        background: [T, H, W] bool, what no mask claims.
+        joints, K: as of `arm_reach`.
+
+    Returns:
+        [T, H, W] bool: next to the wrists of hands whose arms show in most frames, what has an arm's colours.
+    """
+    found = np.zeros_like(background)
+    for places in joints.values():
+        cuff = background & _beyond(places, K, background.shape, _SURE_RADIUS, _CUFF_LENGTH)
+        pixels = cuff.sum(axis=(1, 2))
+        shares = (differs & cuff).sum(axis=(1, 2))[pixels > 0] / pixels[pixels > 0]
+        if len(shares) and np.median(shares) > _SLEEVED:
+            colors = images[differs & cuff] / np.float32(255.0)
+            counts = color_counts(colors, np.ones(len(colors)))
+            usual = np.percentile(counts[color_cells(colors)], _RARE)
+            found[cuff] |= counts[color_cells(images[cuff] / np.float32(255.0))] >= usual
     return found
 
 

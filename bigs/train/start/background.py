@@ -20,7 +20,7 @@ from bigs.data.base import Clip
 from bigs.data.oddities.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
-from bigs.train.start.arms import arm_reach, arms
+from bigs.train.start.arms import arm_reach, arms, cuffs_like_background
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
 from bigs.train.start.shake import SteadyView, steady_view
 from bigs.types import MASK_VALUES, Side
@@ -75,7 +75,7 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluder
         moving = "moves, so that what hides hands is known only where arms may be"
         unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
     else:
-        unknown = _whole(differs, background)
+        unknown = _whole(differs | cuffs_like_background(images, differs, background, joints, K), background)
     if clip.arms is not None:
         unknown |= np.stack(side_by_side(lambda t: clip.arm(t)[::step, ::step], frames))
     whole = unknown.repeat(step, axis=1).repeat(step, axis=2)[:, : clip.height, : clip.width]

@@ -124,6 +124,39 @@ def test_a_run_looks_for_them_where_the_camera_moves(
     assert found[~arm].mean() < 0.05
 
 
+@pytest.mark.parametrize("armed", [True, False])
+def test_before_a_wall_of_its_colour_a_sleeve_goes_on(
+    tmp_path: Path, rng: np.random.Generator, armed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And where there is no arm a wall is one. The hand goes up and down, which shows what is behind it."""
+    hand, arm = hand_and_arm()
+    places = arm_clips.joints()
+    for t in range(FRAMES):
+        up = [-20, 0, 20][t % 3]
+        hand[t], arm[t] = np.roll(hand[t], up, axis=0), np.roll(arm[t], up, axis=0)
+        places[t, :, 1] += 0.004 * up
+    images = np.tile(street(rng)[0], (FRAMES, 1, 1, 1))
+    images[:, :, 64:84] = BLUE
+    if armed:
+        images[arm] = BLUE
+    images[hand] = [0.8, 0.6, 0.5]
+    noisy = images + rng.normal(0, 0.01, images.shape)
+    labels = np.where(hand, np.uint8(150), np.uint8(0))
+    clip = painted_clip(tmp_path, (255 * noisy.clip(0, 1)).round().astype(np.uint8), labels, K)
+    found, moving = unknown_occluders(clip, {"right": places})
+    assert moving is None
+    if not armed:
+        assert not found.any()
+        return
+    middle = scipy.ndimage.binary_erosion(arm, np.ones((1, 11, 1)))  # 14 mm to either side
+    cuff = middle & (scipy.ndimage.distance_transform_edt(~hand) < CUFF_PIXELS)
+    monkeypatch.setattr("bigs.train.start.arms._SLEEVED", 1.0)
+    without = unknown_occluders(clip, {"right": places}).pixels
+    assert found[cuff].mean() > 0.99 and without[cuff].mean() < 0.8
+    near = scipy.ndimage.binary_dilation(arm, np.ones((1, 7, 7)))
+    assert not found[~near].any()
+
+
 def test_the_report_says_that_the_background_moves(
     tiny: Clip, both_hands: dict[Side, HandModel], tmp_path: Path, rng: np.random.Generator
 ) -> None:
