@@ -41,7 +41,9 @@ def with_one_exposure(clip: Clip) -> Clip:
         return clip
     step = max(1, -(-max(clip.width, clip.height) // _SIZE))
     frames = range(len(clip))
-    shown = brightened(clip)
+    bright = brightened(clip)
+    # Exposure also multiplies what a pale picture has for black.
+    shown = bright if bright.black == 0.0 else clip
     images = np.stack(side_by_side(lambda t: shown.image(t)[::step, ::step], frames))
     background = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step] == 0, frames))
     gains = _gains(images, background)

@@ -100,17 +100,24 @@ def test_pictures_that_show_nothing_stay_black(tmp_path: Path) -> None:
     assert brightened(clip) is clip
 
 
-def test_exposure_is_found_in_the_dark(tmp_path: Path) -> None:
-    """Its levels count for pictures as bright as usual; files stay as dark as they are."""
+@pytest.mark.parametrize(("black", "brightness"), [(0.0, 0.15), (0.35, 0.4)], ids=["dark", "pale"])
+def test_exposure_is_found_in_the_dark_and_through_haze(
+    tmp_path: Path, black: float, brightness: float
+) -> None:
+    """Its levels count for pictures as bright as usual; files stay as dark and as pale as they are."""
     rng = np.random.default_rng(1)
     room = np.kron(rng.uniform(0.2, 0.5, (10, 15, 1)), np.ones((8, 8, 3)))
     gains = np.array([1.0, 1.0, 0.8, 1.2, 1.0])
     labels = np.zeros((len(gains), 80, 120), dtype=np.uint8)
     labels[:, 20:50, 20:50] = 150
-    images = 0.15 * gains[:, None, None, None] * np.where(labels[..., None] > 0, 0.8, room)
+    images = black + brightness * np.where(labels[..., None] > 0, 0.8, room)
+    images *= gains[:, None, None, None]
     clip = with_one_exposure(painted_clip(tmp_path, (255.0 * images).round().astype(np.uint8), labels))
     assert clip.gains is not None and clip.brightness == 1.0
     np.testing.assert_allclose(clip.gains, np.repeat(gains[:, None], 3, axis=1), atol=0.06)
     shown = brightened(clip)
     assert np.ptp([shown.image(t)[60:].mean() for t in range(len(gains))]) < 6.0
-    assert shown.image(0)[60:].mean() > 80.0 > 20.0 > clip.image(0)[60:].mean()
+    if black == 0.0:
+        assert shown.image(0)[60:].mean() > 80.0 > 20.0 > clip.image(0)[60:].mean()
+    else:
+        assert shown.image(0)[60:].std() > 1.5 * clip.image(0)[60:].std()
