@@ -149,6 +149,21 @@ def test_obj(playback: Playback, tmp_path: Path, black: float) -> None:
     assert (skin[:, 0] > skin[:, 2] + 0.1).mean() > 0.9
 
 
+def test_a_left_hand_is_coloured_as_the_mirrored_right_one(playback: Playback, tmp_path: Path) -> None:
+    """Colours that tell places, on the canonical hand that both sides share."""
+    places = playback.hands["right"].splats.points
+    colors = (places - places.amin(0)) / (places.amax(0) - places.amin(0))
+    hands = {
+        side: replace(hand, splats=hand.splats._replace(points=places, colors=colors))
+        for side, hand in playback.hands.items()
+    }
+    (path,) = write_format(tmp_path, replace(playback, hands=hands), "obj")
+    shown = trimesh.load(path, process=False, maintain_order=True).visual.vertex_colors[:, :3] / 255
+    count = hands["right"].verts.shape[1]
+    right, left = shown[:count], shown[count : 2 * count]
+    assert np.abs(right - left).mean() < 0.02 < 0.2 < right.std(0).max()
+
+
 def test_rerun(playback: Playback, tiny_clip: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra 'rerun'")
     from rerun.chunk import RrdReader
