@@ -68,6 +68,26 @@ def test_gsplat_receives_the_call(fake, ortho, degree, antialiased):
     assert relative(through.alphas, direct.alphas) < 1e-12
 
 
+@pytest.mark.parametrize("means2d", ["values", "packed"])
+@pytest.mark.parametrize("render_mode", ["RGB", "D"])
+def test_backgrounds_are_those_of_the_engine(fake, means2d, render_mode):
+    """With their gradients: where nothing is rendered there is none."""
+    inputs, mask = scene(n=30), torch.rand(1, 18, 23) < 0.5
+    found = []
+    for backend in ("gsplat", "torch"):
+        backgrounds = inputs["backgrounds"].clone().requires_grad_()
+        layout = means2d if backend == "gsplat" else "values"
+        call = {**inputs, "backgrounds": backgrounds, "pixel_mask": mask, "render_mode": render_mode}
+        colors = rasterization(**call, means2d=layout, backend=backend).colors
+        if render_mode == "RGB":
+            colors.sum().backward()
+            found.append((colors, backgrounds.grad))
+        else:
+            found.append((colors,))
+    for through, direct in zip(*found, strict=True):
+        assert relative(through, direct) < 1e-12
+
+
 @pytest.mark.parametrize("means2d", ["values", "full", "packed"])
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_gsplat_receives_the_layout(fake, means2d, absgrad):

@@ -71,6 +71,7 @@ def test_frames_of_another_exposure_have_another_black(tmp_path: Path) -> None:
     files = clip._pinhole_image(0) / 255.0
     expected = 255.0 * (files / brighter[0] - 0.2) / 0.5
     np.testing.assert_allclose(replace(clip, gains=brighter).image(0), expected.clip(0, 255), atol=0.51)
+    assert np.abs(replace(clip, brightness=1.0).image(0) - 255.0 * (files - 0.2)).max() < 0.51
 
 
 def test_without_black_things_a_clip_is_not_pale(tmp_path: Path) -> None:

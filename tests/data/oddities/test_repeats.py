@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 from toy_clips import painted_clip
 
+from bigs.commands.clips.open import open_clip
+from bigs.data.oddities import repeats
 from bigs.data.oddities.repeats import every_new, with_repeats_noted
+from bigs.hand import HandModel
+from bigs.types import Side
 
 FRAMES = 40
 
@@ -49,12 +55,13 @@ def test_a_group_may_be_longer_or_shorter() -> None:
     [
         np.arange(FRAMES),
         (np.arange(FRAMES) * 0.8).astype(int),  # 24 pictures a second as 30
+        (np.arange(FRAMES) * 0.4).astype(int),  # 12 as 30: two and three in turn
         np.arange(FRAMES) // 5,
         np.zeros(FRAMES, dtype=int),
         np.sort(np.random.default_rng(0).integers(0, 20, FRAMES)),
         np.arange(12) // 2,
     ],
-    ids=["all new", "a few", "too slow", "one picture", "by chance", "too short to tell"],
+    ids=["all new", "a few", "in turn", "too slow", "one picture", "by chance", "too short to tell"],
 )
 def test_others_are_not(shown: np.ndarray) -> None:
     pictures = film(2.0)[shown]
@@ -79,3 +86,15 @@ def test_a_note_says_what_to_do(tmp_path: Path, every: int) -> None:
     notes = with_repeats_noted(clip).notes
     assert len(notes) == len(clip.notes) + every - 1
     assert all(f"bigs convert --every {every}" in note for note in notes)
+
+
+def test_clips_are_opened_with_the_note(
+    tiny_clip: Path, both_hands: Mapping[Side, HandModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(repeats, "_FIRST", 6)  # the little clip has twelve frames
+    assert not open_clip(tiny_clip, both_hands).notes
+    clip = Path(shutil.copytree(tiny_clip, tmp_path / "clip"))
+    images = sorted((clip / "build" / "image").iterdir())
+    for before, after in zip(images[::2], images[1::2], strict=True):
+        shutil.copyfile(before, after)
+    assert any(note.startswith("pictures: of 2 in a row") for note in open_clip(clip, both_hands).notes)
