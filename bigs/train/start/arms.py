@@ -41,10 +41,12 @@ def arm_reach(joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int
         K: [3, 3] of the images.
         shape: of the images.
     """
-    found = np.zeros(shape, dtype=bool)
-    for places in joints.values():
-        found |= _beyond(places, K, shape, _ARM_RADIUS, _ARM_LENGTH)
-    return found
+    return _beyond_any(joints, K, shape, _ARM_RADIUS, _ARM_LENGTH)
+
+
+def cuff_reach(joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The same [T, H, W] next to the wrists."""
+    return _beyond_any(joints, K, shape, _CUFF_RADIUS, _CUFF_LENGTH)
 
 
 def arms(
@@ -106,6 +108,16 @@ def cuffs_like_background(
             counts = color_counts(colors, np.ones(len(colors)))
             usual = np.percentile(counts[color_cells(colors)], _RARE)
             found[cuff] |= counts[color_cells(images[cuff] / np.float32(255.0))] >= usual
+    return found
+
+
+def _beyond_any(
+    joints: Mapping[Side, np.ndarray], K: np.ndarray, shape: tuple[int, ...], radius: float, length: float
+) -> np.ndarray:
+    """`_beyond` of all hands."""
+    found = np.zeros(shape, dtype=bool)
+    for places in joints.values():
+        found |= _beyond(places, K, shape, radius, length)
     return found
 
 

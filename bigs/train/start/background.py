@@ -1,11 +1,11 @@
 """Background pixels that show unlabelled occluders: sleeves, arms, other people.
 
 Masks label a sleeve as background, yet it hides a hand as an object does. With a camera that stands still the
-background is the same in every frame, so whatever differs from it is an unknown occluder. What a pixel shows
-most of the time need not be the background: it may be a forearm that hardly moves. Where a pixel shows two
-colours, the one that the clip's occluders have elsewhere belongs to an occluder. A camera that shakes is held
-still first (see `shake`). Before a background that moves otherwise only arms are looked for (see `arms`), and
-masks that were lost: what they showed may still be there.
+background is the same in every frame, so whatever differs from it, and is no shadow on it, is an unknown
+occluder. What a pixel shows most of the time need not be the background: it may be a forearm that hardly
+moves. Where a pixel shows two colours, the one that the clip's occluders have elsewhere belongs to an
+occluder. A camera that shakes is held still first (see `shake`). Before a background that moves otherwise
+only arms are looked for (see `arms`), and masks that were lost: what they showed may still be there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bigs.data.base import Clip
 from bigs.data.oddities.exposure import median_over_time
 from bigs.motion.masks import short_gaps
 from bigs.threads import side_by_side
-from bigs.train.start.arms import arm_reach, arms, cuffs_like_background
+from bigs.train.start.arms import arm_reach, arms, cuff_reach, cuffs_like_background
 from bigs.train.start.color_counts import color_cells, color_counts, smoothed
 from bigs.train.start.shake import SteadyView, steady_view
 from bigs.types import MASK_VALUES, Side
@@ -28,6 +28,10 @@ from bigs.types import MASK_VALUES, Side
 # Colours (in [0, 1]) that differ by more than this belong to different surfaces; noise and soft shadows
 # differ less.
 _THRESHOLD = 0.06
+# A shadow leaves at least this share of the light, ...
+_SHADED = 0.3
+# ... and as much of red, green and blue, to this share of it. Black says nothing of shares.
+_TINT, _BLACK = 0.1, 0.02
 # Long side in pixels at which frames are compared: occluders are large, and a clip then fits in memory.
 _SIZE = 320
 # A pixel that shows something else in this share of its frames may show an occluder in most of them.
@@ -66,11 +70,11 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluder
     labels = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames))
     background = labels == 0
     K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
-    reach = arm_reach(joints, K, labels.shape)
-    differs, moving = _differing(images, background), None
+    reach, cuffs = arm_reach(joints, K, labels.shape), cuff_reach(joints, K, labels.shape)
+    differs, moving = _differing(images, background, cuffs), None
     if _moves(differs, background, reach):
         moving = "turns, as the camera does"
-        differs = _differing_before(steady_view(images, background, K), images, background)
+        differs = _differing_before(steady_view(images, background, K), images, background, cuffs)
     if _moves(differs, background, reach):
         moving = "moves, so that what hides hands is known only where arms may be"
         unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
@@ -82,24 +86,39 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluder
     return Occluders(whole, moving)
 
 
-def _differing(images: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Where the background [T, H, W] of images [T, H, W, 3] is not what stands still: bool."""
+def _differing(images: np.ndarray, background: np.ndarray, cuffs: np.ndarray) -> np.ndarray:
+    """Where the background [T, H, W] of images [T, H, W, 3] is not what stands still: bool.
+
+    Shadows on it only count in the `cuffs` [T, H, W] of arms, where a sleeve may look like one.
+    """
     still = _still_background(_looks(images, background))
     # A frame at a time: the whole clip in floats is large.
-    return background & np.stack([_unlike(_floats(image), still) for image in images])
+    frames = zip(images, cuffs, strict=True)
+    return background & np.stack([_unlike(_floats(image), still, near) for image, near in frames])
 
 
-def _differing_before(view: SteadyView, images: np.ndarray, background: np.ndarray) -> np.ndarray:
+def _differing_before(
+    view: SteadyView, images: np.ndarray, background: np.ndarray, cuffs: np.ndarray
+) -> np.ndarray:
     """The same where the camera turns."""
     still = _still_background(_looks(view.gathered(images), view.gathered(background)))
     size = images.shape[1:3]
-    found = [_unlike(_floats(image), view.shown_in(t, still, size)) for t, image in enumerate(images)]
+    frames = enumerate(zip(images, cuffs, strict=True))
+    found = [_unlike(_floats(image), view.shown_in(t, still, size), near) for t, (image, near) in frames]
     return background & np.stack(found)
 
 
-def _unlike(colors: np.ndarray, still: np.ndarray) -> np.ndarray:
+def _unlike(colors: np.ndarray, still: np.ndarray, cuffs: np.ndarray) -> np.ndarray:
     """Where colours [H, W, 3] are not the background's; nowhere where that is not a number."""
-    return (np.abs(colors - still) > _THRESHOLD).any(axis=-1)
+    differs = (np.abs(colors - still) > _THRESHOLD).any(axis=-1)
+    return differs & (cuffs | ~_shaded(colors, still))
+
+
+def _shaded(colors: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Where colours [H, W, 3] are the background's with less light, or with more if it is usually shaded."""
+    shares = (colors + _BLACK) / (still + _BLACK)
+    low, high = shares.min(axis=-1), shares.max(axis=-1)
+    return (low > _SHADED) & (high < 1.0 / _SHADED) & (high - low < _TINT * high)
 
 
 def _moves(differs: np.ndarray, background: np.ndarray, reach: np.ndarray) -> bool:

@@ -104,6 +104,42 @@ def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator) -> 
     assert found[~near].mean() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("light", "resting", "counts"),
+    [
+        ([0.5, 0.5, 0.5], False, False),
+        ([0.5, 0.5, 0.5], True, False),
+        ([0.75, 0.78, 0.8], False, False),  # what is left of the light is a little bluer
+        ([0.75, 0.78, 0.8], True, False),
+        ([0.2, 0.2, 0.2], False, True),  # too dark for a shadow
+        ([0.5, 0.6, 0.8], False, True),  # too blue
+    ],
+)
+def test_a_shadow_is_no_occluder(
+    tmp_path: Path, rng: np.random.Generator, light: list[float], resting: bool, counts: bool
+) -> None:
+    """Unless it is next to a wrist, where it may be a sleeve; also if it is there most of the time."""
+    step = 0 if resting else 5
+    hand, shadow = moving_box(5, 5, 12, 12, 5), moving_box(30, 20, 12, 15, step)
+    if resting:
+        shadow[6:] = False
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    images[shadow] *= light
+    images[hand] = [0.8, 0.6, 0.5]
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    far = wrist_at(11 + 5 * np.arange(FRAMES), 5, (0.0, -1.0))
+    found, moving = unknown_occluders(clip, {"right": far})
+    assert moving is None
+    if counts:
+        assert found[shadow].mean() > 0.95
+    else:
+        assert found[shadow].mean() < 0.02 and found.mean() < 0.004
+    near = wrist_at(20.0 + step * np.arange(FRAMES), 35, (1.0, 0.0))
+    found = unknown_occluders(clip, {"right": near}).pixels
+    for t in np.flatnonzero(shadow.any((1, 2))) if not resting else ():
+        assert found[t, 33:38, 22 + step * t : 28 + step * t].all()
+
+
 def test_a_still_clip_has_none(tmp_path: Path, rng: np.random.Generator) -> None:
     hand = moving_box(25, 5, 12, 12, 5)
     images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
