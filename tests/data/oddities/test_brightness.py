@@ -39,36 +39,29 @@ def filmed(
     return replace(clip, object=replace(clip.object, points=np.eye(3)[:2], colors=colors))
 
 
-@pytest.mark.parametrize("brightness", [0.7, 0.4, 0.15])
-def test_dark_pictures_look_as_in_good_light(tmp_path: Path, brightness: float) -> None:
-    well_lit, dark = filmed(tmp_path / "lit", 1.0), filmed(tmp_path / "dark", brightness)
-    shown = brightened(dark)
-    assert shown.brightness == pytest.approx(brightness, rel=0.02)
+@pytest.mark.parametrize(
+    ("black", "brightness"), [(0.0, 0.7), (0.0, 0.4), (0.0, 0.15), (0.2, 0.6), (0.45, 0.4), (0.2, 0.15)]
+)
+def test_dark_and_pale_pictures_look_as_usual(tmp_path: Path, black: float, brightness: float) -> None:
+    usual, worse = filmed(tmp_path / "usual", 1.0), filmed(tmp_path / "worse", brightness, black=black)
+    shown = brightened(worse)
+    assert shown.black == pytest.approx(black, abs=0.01)
+    # What is darkest in a pale clip need not be black.
+    inexact = 0.02 if black == 0.0 else 0.05
+    assert shown.brightness == pytest.approx(brightness, rel=inexact)
     steps = 1.0 / brightness  # of the files' whole numbers
     for t in range(FRAMES):
         for image in (shown.image(t), shown.image_as_taken(t)):
-            assert np.abs(image.astype(float) - well_lit.image(t)).max() < 0.6 * steps + 0.02 * 255
-    assert shown.object is not None and well_lit.object is not None
-    np.testing.assert_allclose(shown.object.colors, well_lit.object.colors, rtol=0.02)
-
-
-@pytest.mark.parametrize(("black", "brightness"), [(0.2, 0.6), (0.45, 0.4), (0.2, 0.15)])
-def test_pale_pictures_look_as_in_clear_air(tmp_path: Path, black: float, brightness: float) -> None:
-    clear, pale = filmed(tmp_path / "clear", 1.0), filmed(tmp_path / "pale", brightness, black=black)
-    shown = brightened(pale)
-    assert shown.black == pytest.approx(black, abs=0.01)
-    assert shown.brightness == pytest.approx(brightness, rel=0.05)
-    for t in range(FRAMES):
-        for image in (shown.image(t), shown.image_as_taken(t)):
-            assert np.abs(image.astype(float) - clear.image(t)).max() < 0.6 / brightness + 0.05 * 255
-    assert shown.object is not None and clear.object is not None
-    np.testing.assert_allclose(shown.object.colors, clear.object.colors, atol=0.04)
+            assert np.abs(image.astype(float) - usual.image(t)).max() < 0.6 * steps + inexact * 255
+    assert shown.object is not None and usual.object is not None
+    np.testing.assert_allclose(shown.object.colors, usual.object.colors, atol=inexact)
 
 
 def test_frames_of_another_exposure_have_another_black(tmp_path: Path) -> None:
-    clip = replace(filmed(tmp_path, 0.5, black=0.2), black=0.2, brightness=0.5)
+    clip = filmed(tmp_path, 0.5, black=0.2)
+    files = clip.image(0) / 255.0
+    clip = replace(clip, black=0.2, brightness=0.5)
     brighter = np.tile([1.1, 1.2, 1.0], (FRAMES, 1))
-    files = clip._pinhole_image(0) / 255.0
     expected = 255.0 * (files / brighter[0] - 0.2) / 0.5
     np.testing.assert_allclose(replace(clip, gains=brighter).image(0), expected.clip(0, 255), atol=0.51)
     assert np.abs(replace(clip, brightness=1.0).image(0) - 255.0 * (files - 0.2)).max() < 0.51

@@ -134,9 +134,11 @@ def test_a_shadow_is_no_occluder(
         assert found[shadow].mean() > 0.95
     else:
         assert found[shadow].mean() < 0.02 and found.mean() < 0.004
+    if resting:
+        return
     near = wrist_at(20.0 + step * np.arange(FRAMES), 35, (1.0, 0.0))
     found = unknown_occluders(clip, {"right": near}).pixels
-    for t in np.flatnonzero(shadow.any((1, 2))) if not resting else ():
+    for t in range(FRAMES):
         assert found[t, 33:38, 22 + step * t : 28 + step * t].all()
 
 
