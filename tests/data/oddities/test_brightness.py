@@ -67,30 +67,27 @@ def test_frames_of_another_exposure_have_another_black(tmp_path: Path) -> None:
     assert np.abs(replace(clip, brightness=1.0).image(0) - 255.0 * (files - 0.2)).max() < 0.51
 
 
-def test_without_black_things_a_clip_is_not_pale(tmp_path: Path) -> None:
-    """Its range is wide enough as it is."""
-    clip = filmed(tmp_path, 1.0, darkest=0.25, subject=1.0, room=1.0)
-    assert brightened(clip) is clip
-
-
-def test_of_a_bright_clip_nothing_changes(tmp_path: Path) -> None:
-    clip = filmed(tmp_path, 1.0)
-    assert brightened(clip) is clip
-
-
-def test_black_things_in_good_light_stay_black(tmp_path: Path) -> None:
-    clip = filmed(tmp_path, 1.0, subject=0.2, room=1.0)
-    assert brightened(clip) is clip
-
-
-def test_bright_things_in_a_dark_room_are_not_cut_off(tmp_path: Path) -> None:
-    """However small they are."""
-    clip = filmed(tmp_path, 1.0, subject=0.9, room=0.11, size=2)
-    assert brightened(clip) is clip
-
-
-def test_pictures_that_show_nothing_stay_black(tmp_path: Path) -> None:
-    clip = filmed(tmp_path, 0.01)
+@pytest.mark.parametrize(
+    ("brightness", "subject", "room", "size", "darkest"),
+    [
+        (1.0, 0.9, 0.6, 15, 0.0),
+        (1.0, 0.2, 1.0, 15, 0.0),
+        (1.0, 0.9, 0.11, 2, 0.0),
+        (1.0, 1.0, 1.0, 15, 0.25),
+        (0.01, 0.9, 0.6, 15, 0.0),
+    ],
+    ids=[
+        "good light",
+        "black things in it",
+        "small bright things in the dark",
+        "nothing is black",
+        "nothing shows",
+    ],
+)
+def test_others_stay_as_they_are(
+    tmp_path: Path, brightness: float, subject: float, room: float, size: int, darkest: float
+) -> None:
+    clip = filmed(tmp_path, brightness, subject=subject, room=room, size=size, darkest=darkest)
     assert brightened(clip) is clip
 
 
