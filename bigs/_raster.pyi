@@ -38,7 +38,6 @@ __all__ = [
     "terms_together_backward",
     "time_engine",
     "times_empty",
-    "times_on",
     "times_seen",
     "touch_backward",
     "touch_forward",
@@ -285,9 +284,6 @@ def cone_distances(
     stop: float,
 ) -> NDArray[np.float64]:
     """Distances [N] of points [N, 3] to the visual hull of silhouettes [T, H, W]."""
-
-def times_on(masks: NDArray[np.bool_], poses: _Poses, points: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """In how many pictures [N] points [N, 3] fall on true pixels of masks [T, H, W]."""
 
 def times_seen(
     shown: NDArray[np.bool_],

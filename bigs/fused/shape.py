@@ -46,11 +46,6 @@ def cone_distances(
     )
 
 
-def times_on(masks: np.ndarray, poses: Poses, points: np.ndarray) -> np.ndarray:
-    """In how many pictures [N] points [N, 3] fall on true pixels of masks [T, H, W]."""
-    return _raster.times_on(np.ascontiguousarray(masks), poses.arrays(), _doubles(points))
-
-
 def times_seen(
     shown: np.ndarray,
     poses: Poses,

@@ -122,10 +122,6 @@ class VisualHull:
         apart = np.argsort(np.arange(len(self.silhouettes)) * _GOLDEN % 1.0, kind="stable")
         return fused.cone_distances(self.silhouettes, self._poses, points, apart, self.agreeing, stop)
 
-    def share_seen(self, points: np.ndarray, masks: np.ndarray) -> np.ndarray:
-        """In what share [N] of the frames each point falls on a true pixel of `masks` [T, H, W] (bool)."""
-        return fused.times_on(masks, self._poses, points) / len(masks)
-
     @property
     def _poses(self) -> fused.Poses:
         return fused.Poses(self.K, self.rotations, self.centers)

@@ -206,8 +206,9 @@ def measured_anchor(map_: ObjectMap, anchor: Anchor, config: TrackerConfig) -> A
         weight = 1.0 / np.linalg.norm(shifts, axis=1).clip(1e-6)
     spread = 1.4826 * np.median(np.abs(shifts), axis=0)
     across = float(np.sqrt((spread[:2] ** 2).mean()))
+    spread_of_turns = 1.4826 * float(np.median(np.abs(turns)))
     return anchor._replace(
-        turn_sigma=max(1.4826 * float(np.median(np.abs(turns))), _LEAST_TURN),
+        turn_sigma=float(np.clip(spread_of_turns, _LEAST_TURN, np.radians(config.most_turn_sigma))),
         shift_sigma=np.array([across, across, spread[2]]).clip(_LEAST_SHIFT * transl[:, 2].mean()),
     )
 

@@ -40,6 +40,9 @@ class TrackerConfig:
     # Prior errors of given poses: degrees, and shares of the depth, across the ray and along it.
     turn_sigma: float = 3.0
     shift_sigma: tuple[float, float] = (0.015, 0.03)
+    # Given poses are not thought to err by more than this, degrees, however far tracks leave them: marks that
+    # are alike slide along a handle together, and then it is tracks that err.
+    most_turn_sigma: float = 2.0
     # Errors of observations are correlated: true errors are about this many times those of independent ones.
     caution: float = 3.0
     # Up to this factor where poses leave the given ones for long by this many of their standard deviations.

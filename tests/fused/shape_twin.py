@@ -49,12 +49,6 @@ def pixels(
     return np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int), depth, inside
 
 
-def times_on(masks: np.ndarray, poses: Poses, points: np.ndarray) -> np.ndarray:
-    found = [pixels(masks.shape[1:], poses, t, points) for t in range(len(masks))]
-    on = [inside & mask[row, column] for mask, (row, column, _, inside) in zip(masks, found, strict=True)]
-    return np.sum(on, axis=0)
-
-
 def nearest_depths(shape: tuple[int, ...], poses: Poses, t: int, surface: np.ndarray) -> np.ndarray:
     row, column, depth, inside = pixels(shape, poses, t, surface)
     buffer = np.full(shape, np.inf)

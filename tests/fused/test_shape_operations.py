@@ -55,12 +55,6 @@ def test_distances_to_cones(poses: Poses, points: np.ndarray, agreeing: int, sto
     assert len(np.unique(found)) > 1000
 
 
-def test_points_on_masks(poses: Poses, points: np.ndarray, masks: np.ndarray) -> None:
-    found = shape.times_on(masks, poses, points)
-    np.testing.assert_array_equal(found, twin.times_on(masks, poses, points))
-    assert 0 < found.mean() < FRAMES
-
-
 def test_what_shows(poses: Poses, masks: np.ndarray, ball: tuple[np.ndarray, np.ndarray]) -> None:
     arguments = (masks, poses, *ball, ball[0], 0.2, 0.006)
     found = shape.times_seen(*arguments)
@@ -156,14 +150,14 @@ def test_what_meets_nothing_stays(space: EmptySpace) -> None:
 def test_arrays_that_do_not_fit(
     poses: Poses, points: np.ndarray, masks: np.ndarray, space: EmptySpace
 ) -> None:
-    with pytest.raises(ValueError, match=re.escape("masks: expected 64800 values, found 75600")):
-        shape.times_on(masks, Poses(K, poses.rotations[1:], poses.centers[1:]), points)
+    with pytest.raises(ValueError, match=re.escape("shown: expected 64800 values, found 75600")):
+        shape.times_empty(masks, Poses(K, poses.rotations[1:], poses.centers[1:]), points, points, 0.006)
     with pytest.raises(ValueError, match="rotations: expected 7 values, found 6"):
-        shape.times_on(masks, Poses(K, poses.rotations[1:], poses.centers), points)
-    with pytest.raises(ValueError, match=re.escape("masks: expected the shape (T, H, W)")):
-        shape.times_on(masks[0], poses, points)
+        shape.times_empty(masks, Poses(K, poses.rotations[1:], poses.centers), points, points, 0.006)
+    with pytest.raises(ValueError, match=re.escape("shown: expected the shape (T, H, W)")):
+        shape.times_empty(masks[0], poses, points, points, 0.006)
     with pytest.raises(ValueError, match="points: expected rows of 3 values"):
-        shape.times_on(masks, poses, points[:, :2])
+        shape.times_empty(masks, poses, points[:, :2], points, 0.006)
     with pytest.raises(ValueError, match="normals: expected 5000 values, found 4999"):
         shape.times_seen(masks, poses, points, points[1:], points, 0.2, 0.006)
     with pytest.raises(ValueError, match="symmetries: expected 2 rows, found 1"):

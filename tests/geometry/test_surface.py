@@ -193,19 +193,6 @@ def test_strays_small_errors_and_unseen_points_open_nothing() -> None:
         np.testing.assert_array_equal(silhouette_around_points(allowed, points, K), plain)
 
 
-def test_share_seen_counts_frames(masks_and_hull) -> None:
-    masks, hull = masks_and_hull
-    inside, outside = MIDDLE, MIDDLE + np.array([0.0, 0.0, 0.11])
-    points = np.stack([inside, outside])
-    some = masks.copy()
-    some[10:] = False
-    np.testing.assert_allclose(hull.share_seen(points, masks)[0], 1.0)
-    np.testing.assert_allclose(hull.share_seen(points, some), [0.25, hull.share_seen(points, some)[1]])
-    assert hull.share_seen(points, masks)[1] < 0.5
-    behind_some = hull.share_seen(MIDDLE + 0.7 * even_directions(8), np.ones_like(masks))
-    assert (behind_some < 0.5).all()
-
-
 def test_points_carve_a_hollow_that_silhouettes_cannot_show() -> None:
     grid = ball_grid()
     # A flat bottom 3 cm below the ball's pole, seen as points.

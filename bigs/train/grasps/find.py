@@ -266,7 +266,8 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
 
     From the last frame of a grasp to the first of the next the turn follows the minimum-jerk profile of human
     reaching (Flash and Hogan 1985). Silhouettes tell a turned hand badly; what it came from and what it turns
-    into are known well.
+    into are known well. A hand may turn by more than half a circle, so of the two ways it takes the one that
+    the orientations between speak for.
 
     Args:
         orient: [T, 3, 3] the hand's orientation.
@@ -288,7 +289,9 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
         between = torch.arange(first + 1, last)
         u = (between - first) / (last - first)
         share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
-        orient[between] = carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * turn)
+        other = turn - 2.0 * torch.pi * torch.nn.functional.normalize(turn, dim=0)
+        ways = [carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * way) for way in (turn, other)]
+        orient[between] = min(ways, key=lambda way: float((way - orient[between]).square().sum()))
     return orient
 
 

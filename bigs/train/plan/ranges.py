@@ -87,7 +87,6 @@ RANGES: dict[type, dict[str, Range]] = {
         "surface_resolution": Range(8, 1000),
         "surface_agreeing": _COUNT,
         "surface_smoothing": Range(0.0, 100.0),
-        "surface_shown": _SHARE,
         "seen_frames": _COUNT,
         "surface_guessed": _SHARE,
         "surface_kept": Range(0.01, 1e9),

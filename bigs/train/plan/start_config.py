@@ -22,10 +22,11 @@ class InitialConfig:
     surface_reach: float = 0.016
     # Frames that must agree before a place is carved away, since single masks and poses are wrong.
     surface_agreeing: int = 3
-    # The surface may exceed the points' convex hull by this much, metres, and more only where the masks show
-    # object in more than this share of the frames.
+    # The surface may exceed the points' convex hull by this much, metres, and on sides that no camera looked
+    # at by as much as the masks ask for: each millimetre must explain a strip along the whole outline, on
+    # average over the frames, that is this many millimetres wide.
     surface_margin: float = 0.002
-    surface_shown: float = 0.8
+    surface_price: float = 0.006
     # Surface counts as seen if it shows in this many frames: fewer may be an error of a mask or pose.
     seen_frames: int = 3
     # Typical error of poses, metres: nearer surface does not occlude, and space nearer than this is not known

@@ -161,7 +161,7 @@ def _object_surfaces(
 ) -> _ObjectSurfaces:
     try:
         hull = find_object_hull(clip, unknown, start, initial)
-        grid = hull.closed(initial, hull.points, hull.normals, initial.surface_reach)
+        grid = hull.closed(initial, hull.points, hull.normals)
         closed = extract_mesh(grid)
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)

@@ -62,7 +62,7 @@ def complete(
         earlier: symmetries for which the evidence was strong before; they are candidates, and they count if
             the evidence is not strong for any now.
     """
-    plain = hull.closed(initial, hull.points, hull.normals, initial.surface_reach)
+    plain = hull.closed(initial, hull.points, hull.normals)
     points, normals, seen = seen_samples(hull.views, plain, initial.seen_frames, initial.seen_tolerance)
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
@@ -78,8 +78,7 @@ def complete(
         return replace(nothing, why_not="no strong evidence for any")
     known = SeenSurface(hull.points, hull.normals, colors[tree.query(hull.points)[1]])
     whole = completed(known, symmetries, is_empty, config.gap)
-    # The points now surround the object, so nothing lies beyond their convex hull.
-    grid = hull.closed(initial, whole.points, whole.normals, 0.0)
+    grid = hull.closed(initial, whole.points, whole.normals, symmetries)
     added = slice(len(known.points), None)
     return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +22,10 @@ from bigs.geometry.surface import (
     empty_grid,
     silhouette_around_points,
 )
+from bigs.geometry.symmetry import SeenSurface, Symmetry
 from bigs.threads import side_by_side
 from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.far_side import far_side_depth
 from bigs.train.start.initial import ObjectStart
 from bigs.types import MASK_VALUES
 
@@ -65,33 +68,43 @@ class ObjectHull:
     """The visual hull from the clip's frames, and the object's points in it."""
 
     grid: DistanceGrid  # distance to the visual hull; exact up to `InitialConfig.surface_reach`
-    shown: np.ndarray  # [X * Y * Z] share of the frames that show object there; 0 outside the hull's reach
     points: np.ndarray  # [N, 3] metres, inside the silhouettes
     normals: np.ndarray  # [N, 3] unit, outward
     views: ObjectViews  # of the frames that count
 
     def closed(
-        self, config: InitialConfig, points: np.ndarray, normals: np.ndarray, allowance: float
+        self,
+        config: InitialConfig,
+        points: np.ndarray,
+        normals: np.ndarray,
+        symmetries: Sequence[Symmetry] = (),
     ) -> DistanceGrid:
         """The surface through points [N, 3] with normals, within their convex hull or little more.
 
-        Beyond faces of that hull that no camera looked at, what nearly always shows as object stays, up to
-        twice `allowance` metres: the far side of an object that was never turned does, the space that a hand
-        always covers does not. Beyond the others it would have hidden the points.
+        Beyond faces of that hull that no camera looked at, the object reaches as far as silhouettes ask for.
+        Beyond the others it would have hidden the points. With `symmetries`, which have added their points,
+        cameras also looked at what these make of it.
         """
         distance = self.grid.values.ravel().copy()
         doubtful = np.flatnonzero(distance < config.surface_reach)
         faces = scipy.spatial.ConvexHull(points)
         planes = faces.equations
         least = min(config.seen_frames, len(self.views.shown))
-        turned = self._frames_facing(points[faces.simplices].mean(1), planes[:, :3]) < least
+        turned = np.ones(len(planes), dtype=bool)
+        for places, facing in _carried(points[faces.simplices].mean(1), planes[:, :3], symmetries):
+            turned &= self._frames_facing(places, facing) < least
         corners = self.grid.points()[doubtful]
-        beyond = distance_to_planes(corners, planes)
         if turned.any() and not turned.all():
-            relief = allowance * ((self.shown[doubtful] - config.surface_shown) / 0.1).clip(0.0)
-            behind = distance_to_planes(corners, planes[turned]) - relief
-            beyond = np.maximum(distance_to_planes(corners, planes[~turned]), behind)
-        distance[doubtful] = np.maximum(distance[doubtful], beyond - config.surface_margin)
+            beyond = distance_to_planes(corners, planes[~turned]) - config.surface_margin
+            behind = distance_to_planes(corners, planes[turned]) - config.surface_margin
+            possible = (distance[doubtful] < 0.0) & (beyond <= 0.0)
+            behind -= far_side_depth(
+                self.views, corners[possible], behind[possible], self.grid.spacing, config.surface_price
+            )
+            beyond = np.maximum(beyond, behind)
+        else:
+            beyond = distance_to_planes(corners, planes) - config.surface_margin
+        distance[doubtful] = np.maximum(distance[doubtful], beyond)
         carved = DistanceGrid(distance.reshape(self.grid.values.shape), self.grid.origin, self.grid.spacing)
         blended = blend_with_points(carved, points, normals, config.surface_reach)
         return replace(blended, values=gaussian_filter(blended.values, config.surface_smoothing))
@@ -102,6 +115,20 @@ class ObjectHull:
             (self.views.directions(t, places) * normals).sum(-1) > 0.0 for t in range(len(self.views.shown))
         ]
         return np.sum(facing, axis=0)
+
+
+def _carried(
+    points: np.ndarray, normals: np.ndarray, symmetries: Sequence[Symmetry]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points and normals [N, 3], and what symmetries one after the other carried there."""
+    found = [(points, normals)]
+    for symmetry in reversed(symmetries):
+        found += [
+            (image.points, image.normals)
+            for place in found
+            for image in symmetry.images(SeenSurface(*place, np.zeros_like(points)))
+        ]
+    return found
 
 
 def find_object_hull(
@@ -138,12 +165,8 @@ def find_object_hull(
     if len(points) < _MIN_POINTS:
         raise ValueError(f"only {len(points)} of {len(start.points)} points lie inside the silhouettes")
     views = ObjectViews(labels == MASK_VALUES["object"], clip.K, rotations, centers)
-    shown = np.zeros(len(corners))
-    near = distance < config.surface_reach
-    shown[near] = hull.share_seen(corners[near], views.shown)
     return ObjectHull(
         DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing),
-        shown,
         points,
         outward_normals(points, hull, views, grid.spacing, config.seen_tolerance),
         views,

@@ -345,7 +345,6 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<shape::SymmetryJudge>()?;
     m.add_class::<shape::NearestPoints>()?;
     m.add_function(wrap_pyfunction!(shape::cone_distances, m)?)?;
-    m.add_function(wrap_pyfunction!(shape::times_on, m)?)?;
     m.add_function(wrap_pyfunction!(shape::times_seen, m)?)?;
     m.add_function(wrap_pyfunction!(shape::times_empty, m)?)?;
     m.add_function(wrap_pyfunction!(shape::beyond_planes, m)?)?;

@@ -85,20 +85,6 @@ pub(crate) fn cone_distances<'py>(
     Ok(gradient(py, run(py, || views.cones(&cones, points))?))
 }
 
-/// In how many pictures `[N]` points `[N, 3]` fall on true pixels of `masks` `[T, H, W]`. Raises ValueError.
-#[pyfunction]
-pub(crate) fn times_on<'py>(
-    py: Python<'py>,
-    masks: &Bound<'py, PyAny>,
-    poses: Poses<'py>,
-    points: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyArray1<u32>>> {
-    let (masks, points) = (slice("masks", masks)?, slice("points", points)?);
-    let views = poses.views("masks", masks.shape())?;
-    let (masks, points) = (contiguous("masks", &masks)?, rows("points", &points)?);
-    Ok(gradient(py, run(py, || views.times_on(masks, points))?))
-}
-
 /// In how many pictures `[N]` points of a surface show, given its normals and samples `[M, 3]`. Raises ValueError.
 #[pyfunction]
 pub(crate) fn times_seen<'py>(

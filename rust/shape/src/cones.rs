@@ -74,28 +74,6 @@ impl Views<'_> {
         let mix = |[a, b]: [f64; 2], share: f64| a + share * (b - a);
         Some(mix([mix(upper, right), mix(lower, right)], down) * camera[2] / self.focal[0])
     }
-
-    /// In how many pictures each point falls on a true pixel of `masks`, T × H × W.
-    ///
-    /// # Errors
-    /// A length that does not fit.
-    pub fn times_on(&self, masks: &[bool], points: &[Vec3]) -> Result<Vec<u32>, ShapeError> {
-        self.check("masks", masks.len())?;
-        let pixels = self.width * self.height;
-        let mut counts = vec![0; points.len()];
-        (points.par_chunks(PIECE), counts.par_chunks_mut(PIECE))
-            .into_par_iter()
-            .for_each(|(points, counts)| {
-                for t in 0..self.centers.len() {
-                    let mask = &masks[t * pixels..][..pixels];
-                    for (&point, count) in points.iter().zip(counts.iter_mut()) {
-                        let pixel = self.pixel(self.camera(t, point));
-                        *count += u32::from(pixel.is_some_and(|pixel| mask[pixel]));
-                    }
-                }
-            });
-        Ok(counts)
-    }
 }
 
 /// Puts a value in its place among some in descending order, of which the least falls out.

@@ -86,7 +86,6 @@ fn the_near_side_shows_and_hides() {
         views.times_empty(&shown, &points, &surface, 0.006).unwrap(),
         [1, 0, 0, 0]
     );
-    assert_eq!(views.times_on(&shown, &points).unwrap(), [1, 1, 1, 0]);
 }
 
 #[test]
@@ -230,8 +229,7 @@ fn what_does_not_fit_or_is_no_number() {
     let (rotations, centers) = ([STILL], [[0.0, 0.0, f64::NAN]]);
     let views = views(&rotations, &centers);
     let shown = vec![true; SIDE * SIDE];
-    assert!(views.times_on(&shown[1..], &[]).is_err());
-    assert_eq!(views.times_on(&shown, &[[0.0; 3]]).unwrap(), [0]);
+    assert!(views.times_empty(&shown[1..], &[], &[], 0.0).is_err());
     assert_eq!(
         views.times_empty(&shown, &[[0.0; 3]], &[[0.0; 3]], 0.0).unwrap(),
         [0]

@@ -33,7 +33,7 @@ INITIAL = InitialConfig(surface_resolution=56)
 
 @pytest.fixture(scope="module")
 def one_side(whole_bottle: tuple[Clip, HandObjectTrajectory]) -> tuple[Clip, ObjectHull, ObjectStart]:
-    clip = limited_view(*whole_bottle, range(12))
+    clip = limited_view(*whole_bottle, range(8))
     start = smooth_object(object_in_camera(clip, INITIAL), 2.0)
     return clip, find_object_hull(clip, nothing_hides(clip), start, INITIAL), start
 
@@ -55,7 +55,7 @@ def test_the_unseen_side_comes_nearer_to_the_truth(
     found = complete(hull, start, INITIAL, CompletionConfig())
     assert found.seen < 0.7
     assert found.symmetries and len(found.points) == len(found.colors) > 100
-    before = score(hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach), whole_bottle[1])
+    before = score(hull.closed(INITIAL, hull.points, hull.normals), whole_bottle[1])
     after = score(found.surface, whole_bottle[1])
     assert after.chamfer.squared < 0.8 * before.chamfer.squared
     assert after.f5 > before.f5 and after.f10 >= before.f10
@@ -108,7 +108,7 @@ def test_less_counts_as_seen_the_more_frames_must_show_it(
     one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
     _, hull, _ = one_side
-    surface = hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach)
+    surface = hull.closed(INITIAL, hull.points, hull.normals)
     shares = [seen_samples(hull.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
     assert shares[0] > shares[1] > shares[2] > 0.0
     assert seen_samples(hull.views, surface, 3, 0.0).seen.mean() < shares[1]
@@ -119,7 +119,7 @@ def test_weak_evidence_changes_nothing(one_side: tuple[Clip, ObjectHull, ObjectS
     base = CompletionConfig()
     strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
     found = complete(hull, start, INITIAL, strict)
-    plain = hull.closed(INITIAL, hull.points, hull.normals, INITIAL.surface_reach)
+    plain = hull.closed(INITIAL, hull.points, hull.normals)
     assert "no strong evidence" in str(found)
     np.testing.assert_array_equal(found.surface.values, plain.values)
 

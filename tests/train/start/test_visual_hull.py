@@ -4,56 +4,107 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.spatial
+import skimage.draw
+from scipy.spatial.transform import Rotation
 
 from bigs.geometry.coverage import ObjectViews
-from bigs.geometry.surface import DistanceGrid, convex_distance, empty_grid
+from bigs.geometry.surface import (
+    DistanceGrid,
+    VisualHull,
+    convex_distance,
+    empty_grid,
+    silhouette_distance,
+)
+from bigs.geometry.symmetry import Symmetry
 from bigs.train.plan.start_config import InitialConfig
+from bigs.train.start.far_side import far_side_depth
 from bigs.train.start.visual_hull import ObjectHull
 
 HALF = np.array([0.03, 0.03, 0.02])
+CORNERS = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+K = np.array([[900.0, 0.0, 80.0], [0.0, 900.0, 80.0], [0.0, 0.0, 1.0]])
 CONFIG = InitialConfig()
 
 
-def seen_from_the_front(frames: int) -> ObjectHull:
-    """A box before a camera that looks along +z; masks say nothing of its depth, points lie on its front."""
-    grid = empty_grid(np.full(3, -0.06), np.full(3, 0.06), 48)
-    corners = grid.points()
-    # Silhouettes bound it sideways only.
-    hull = np.abs(corners[:, :2]).max(1) - HALF[0]
+def turning_box(most: float, deep: float = 0.0) -> ObjectHull:
+    """A box that turns by up to `most` degrees either way about y before the camera.
+
+    Points lie on the side that it shows, and on its rim so many metres deep.
+    """
+    turns = np.linspace(-most, most, 9)
+    rotations = Rotation.from_euler("y", turns[:, None], degrees=True).as_matrix()
+    centers = np.tile([0.0, 0.0, 0.7], (len(turns), 1))
+    masks = np.zeros((len(turns), 160, 160), dtype=bool)
+    for mask, rotation, center in zip(masks, rotations, centers, strict=True):
+        cam = CORNERS @ rotation.T + center
+        pixels = cam[:, :2] / cam[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5
+        outline = pixels[scipy.spatial.ConvexHull(pixels).vertices]
+        mask[skimage.draw.polygon(outline[:, 1], outline[:, 0], mask.shape)] = True
+    grid = empty_grid(np.full(3, -0.08), np.full(3, 0.08), 64)
+    silhouettes = np.stack([silhouette_distance(mask) for mask in masks])
+    hull = VisualHull(silhouettes, K, rotations, centers).distance(grid.points())
     side = np.linspace(-1.0, 1.0, 12)
     x, y = (HALF[0] * values.ravel() for values in np.meshgrid(side, side))
-    # A little depth behind the front, as points on the rim have it.
-    z = np.where(np.maximum(np.abs(x), np.abs(y)) > 0.99 * HALF[0], 0.0, -HALF[2])
-    views = ObjectViews(
-        np.ones((frames, 8, 8), dtype=bool),
-        np.array([[10.0, 0.0, 4.0], [0.0, 10.0, 4.0], [0.0, 0.0, 1.0]]),
-        np.repeat(np.eye(3)[None], frames, axis=0),
-        np.tile([0.0, 0.0, 0.7], (frames, 1)),
-    )
-    points = np.stack([x, y, z], axis=-1)
+    rim = np.maximum(np.abs(x), np.abs(y)) > 0.99 * HALF[0]
+    points = np.stack([x, y, np.where(rim, deep - HALF[2], -HALF[2])], axis=-1)
     return ObjectHull(
         DistanceGrid(hull.reshape(grid.values.shape), grid.origin, grid.spacing),
-        (hull < 0.0).astype(float),
         points,
         np.tile([0.0, 0.0, -1.0], (len(points), 1)),
-        views,
+        ObjectViews(masks, K, rotations, centers),
     )
 
 
-@pytest.mark.parametrize("frames", [1, 5])
-def test_it_is_closed_behind_its_points_and_not_before_them(frames: int) -> None:
-    hull = seen_from_the_front(frames)
-    surface = hull.closed(CONFIG, hull.points, hull.normals, CONFIG.surface_reach)
-    axis = np.zeros((2, 3))
-    axis[:, 2] = [-HALF[2] - 0.006, 0.012]
-    index = np.round((axis - surface.origin) / surface.spacing).astype(int)
-    before, behind = surface.values[tuple(index.T)]
-    assert before > 0.0, "space that would hide the points is part of the object"
-    assert behind < 0.0, "nothing is left behind the points"
+def depths(surface: DistanceGrid) -> np.ndarray:
+    """The least and the greatest z [2] inside the surface on the line through the object's middle."""
+    middle = np.round((np.zeros(2) - surface.origin[:2]) / surface.spacing).astype(int)
+    inside = np.flatnonzero(surface.values[middle[0], middle[1]] < 0.0)
+    return surface.origin[2] + surface.spacing * inside[[0, -1]]
 
 
-def test_without_allowance_it_ends_at_the_points_hull() -> None:
-    hull = seen_from_the_front(5)
-    surface = hull.closed(CONFIG, hull.points, hull.normals, 0.0)
+def test_the_far_side_lies_where_outlines_end() -> None:
+    box = turning_box(25.0, deep=0.004)
+    front, back = depths(box.closed(CONFIG, box.points, box.normals))
+    assert front > -HALF[2] - 0.004, "space that would hide the points is part of the object"
+    assert back == pytest.approx(HALF[2], abs=0.006)
+
+
+def test_the_hull_alone_is_deeper() -> None:
+    assert depths(turning_box(25.0).grid)[1] > HALF[2] + 0.02
+
+
+def test_where_outlines_ask_for_nothing_it_ends_at_the_points_hull() -> None:
+    box = turning_box(25.0, deep=2.0 * HALF[2])
+    surface = box.closed(CONFIG, box.points, box.normals)
     inside = surface.points()[surface.values.ravel() < 0.0]
-    assert convex_distance(inside, hull.points).max() <= CONFIG.surface_margin
+    assert convex_distance(inside, box.points).max() <= CONFIG.surface_margin + surface.spacing
+
+
+def test_cameras_looked_at_what_a_mirror_makes_of_a_side() -> None:
+    box = turning_box(25.0, deep=0.004)
+    near = Symmetry("plane", np.array([0.0, 0.0, 0.004 - HALF[2]]), np.array([0.0, 0.0, 1.0]))
+    across = Symmetry("plane", np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    backs = [
+        depths(box.closed(CONFIG, box.points, box.normals, symmetries))[1]
+        for symmetries in ([], [across], [near], [across, near])
+    ]
+    # Only the first shows the back, wherever it puts it.
+    assert backs[0] == backs[1] > backs[2] + 0.015
+    assert backs[3] == backs[2]
+
+
+def test_depth_is_what_explains_most_for_its_price() -> None:
+    box = turning_box(25.0)
+    places = box.grid.points()[box.grid.values.ravel() < 0.0]
+    beyond = places[:, 2] + HALF[2]
+
+    def depth(price: float) -> float:
+        return far_side_depth(box.views, places, beyond, box.grid.spacing, price)
+
+    assert depth(CONFIG.surface_price) == pytest.approx(2.0 * HALF[2], abs=0.005)
+    assert depth(1.0) == 0.0
+    assert depth(0.0) >= depth(CONFIG.surface_price)
+    # Nothing is explained by what no picture shows.
+    nowhere = ObjectViews(np.zeros_like(box.views.shown), K, box.views.rotations, box.views.centers)
+    assert far_side_depth(nowhere, places, beyond, box.grid.spacing, 0.006) == 0.0
