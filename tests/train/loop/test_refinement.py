@@ -65,11 +65,11 @@ def test_a_print_is_split_and_a_tint_is_not(made: tuple[Scene, Evidence]) -> Non
     left = torch.arange(evidence.targets.width) < middle
     found = unresolved(scene, printed(scene, evidence, left))
     shows = found.pixels > 0.5
-    always_left = shows & (columns.amax(0) < middle - 18.0)
-    always_right = shows & (columns.amin(0) > middle + 18.0)
+    always_left = shows & (columns.amax(0) < middle - 8.0)
+    always_right = shows & (columns.amin(0) > middle + 8.0)
     assert min(always_left.sum(), always_right.sum()) > 20
     per_pixel = found.error / found.pixels.clamp_min(1e-3)
-    assert per_pixel[always_left].median() > 50.0 * per_pixel[always_right].max()
+    assert per_pixel[always_left].median() > 50.0 * per_pixel[always_right].quantile(0.95)
 
     splats = scene.object_splats
     assert isinstance(splats, ObjectDetail)
