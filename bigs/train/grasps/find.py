@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
@@ -37,6 +38,10 @@ _AT_REST = 0.003
 # Pictures say more than estimates, so in the second cut half of a frame's price comes from the masks.
 _ESTIMATE_SHARE = 0.5
 
+# Errors of orientations between grasps, radians: as found; of an even turn at its ends; and what is added half
+# way, as a share of the turn.
+_FOUND_ERROR, _EVEN_ERROR, _WAY_ERROR = math.radians(8.0), math.radians(2.0), 0.1
+
 # How badly a hand's outline in poses of some frames [B], which may repeat, disagrees with its masks: [B]
 # squared error per pixel of the hand, NaN in frames whose masks say nothing.
 Mismatch = Callable[[Side, HandFrames, Tensor], Tensor]
@@ -69,7 +74,7 @@ def find_grasps(
 
     All poses become start values: residuals are zero afterwards. Fingers of free frames start from their
     estimates, corrected as those of the nearest grasps had to be, and their depths are known better than an
-    outline tells them (see `expected_depths`).
+    outline tells them (see `expected_depths`). Their orientations are those of `turned_between`.
 
     Args:
         scene: changed in place.
@@ -262,15 +267,16 @@ def _in_frame_of(carrier: ObjectFrames, joints: Tensor, stage: GraspStage) -> tu
 
 
 def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest: int) -> Tensor:
-    """Orientations in which a hand turns evenly from one grasp to the next, as seen from the object.
+    """Orientations between grasps, of two guesses with unrelated errors: as found, and an even turn.
 
-    From the last frame of a grasp to the first of the next the turn follows the minimum-jerk profile of human
-    reaching (Flash and Hogan 1985). Silhouettes tell a turned hand badly; what it came from and what it turns
-    into are known well. A hand may turn by more than half a circle, so of the two ways it takes the one that
-    the orientations between speak for.
+    From the last frame of a grasp to the first of the next a hand turns about evenly as seen from the object,
+    after the minimum-jerk profile of human reaching (Flash and Hogan 1985). Silhouettes tell a turned hand
+    badly; what it came from and what it turns into are known well. The further it turns, and the further from
+    both ends, the less is known of its way. It may turn by more than half a circle, so of the two ways it
+    takes the one that the orientations found speak for.
 
     Args:
-        orient: [T, 3, 3] the hand's orientation.
+        orient: [T, 3, 3] the hand's orientation as found.
         carrier: [T, 3, 3] the object's.
         grasps: stretches of frames, in order and disjoint.
         longest: moves that take more frames than this are left as they are.
@@ -287,11 +293,16 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
         here = carrier[first].T @ orient[first]
         turn = matrix_to_axis_angle(here.T @ there)
         between = torch.arange(first + 1, last)
+        found = orient[between]
         u = (between - first) / (last - first)
         share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
         other = turn - 2.0 * torch.pi * torch.nn.functional.normalize(turn, dim=0)
         ways = [carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * way) for way in (turn, other)]
-        orient[between] = min(ways, key=lambda way: float((way - orient[between]).square().sum()))
+        even = min(ways, key=lambda way: float((way - found).square().sum()))
+        error = _EVEN_ERROR + _WAY_ERROR * turn.norm() * 4.0 * u * (1.0 - u)
+        weight = _FOUND_ERROR**2 / (_FOUND_ERROR**2 + error**2)
+        apart = matrix_to_axis_angle(found.transpose(-1, -2) @ even)
+        orient[between] = found @ axis_angle_to_matrix(weight[:, None] * apart)
     return orient
 
 

@@ -355,22 +355,31 @@ def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
     assert gradient[1] < 0 and gradient.isfinite().all() and not gradient[[0, 2]].any()
 
 
-def test_a_hand_turns_evenly_from_grasp_to_grasp_as_seen_from_the_object() -> None:
+GRASPED = [range(0, 6), range(15, 20)]
+
+
+def turning(angle: float) -> tuple[Tensor, Tensor]:
+    """Orientations of a hand between two grasps, which turns evenly by `angle`, and of the object: [20, 3, 3]."""
     carrier = axis_angle_to_matrix(torch.linspace(0, 1, 20)[:, None] * torch.tensor([0.3, 1.0, 0.2]))
-    turn = torch.tensor([0.0, 0.0, 1.2])
-    grasped = [range(0, 6), range(15, 20)]
-    relative = torch.eye(3).repeat(20, 1, 1)
-    relative[15:] = axis_angle_to_matrix(turn)
-    wrong = relative.clone()
-    wrong[6:15] = axis_angle_to_matrix(torch.tensor([2.0, 0.0, 0.0]))
-    orient = turned_between(carrier @ wrong, carrier, grasped, 16)
-    angles = rotation_angle(carrier.transpose(-1, -2) @ orient)
-    torch.testing.assert_close(angles[[0, 5]], torch.zeros(2), atol=1e-3, rtol=0)
-    torch.testing.assert_close(angles[15:], torch.full((5,), 1.2), atol=1e-3, rtol=0)
-    steps = angles[5:16].diff()
-    assert (steps > 0).all() and steps[[0, -1]].max() < 0.3 * steps.max(), "slow, fast, slow"
-    untouched = turned_between(carrier @ wrong, carrier, grasped, 8)
-    torch.testing.assert_close(untouched, carrier @ wrong)
+    u = ((torch.arange(20.0) - 5.0) / 10.0).clamp(0.0, 1.0)
+    share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+    return carrier @ axis_angle_to_matrix(share[:, None] * torch.tensor([0.0, 0.0, angle])), carrier
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2, 3.0, 3.6])
+def test_between_grasps_an_even_turn_and_what_was_found_count(angle: float) -> None:
+    """Also where it turns by more than half a circle, which seen from its ends is a turn the other way."""
+    true, carrier = turning(angle)
+    torch.testing.assert_close(turned_between(true, carrier, GRASPED, 16), true, atol=1e-3, rtol=0)
+    found = true.clone()
+    found[6:15] = true[6:15] @ axis_angle_to_matrix(torch.tensor([0.2, 0.0, 0.0]))
+    orient = turned_between(found, carrier, GRASPED, 16)
+    errors = rotation_angle(true.transpose(-1, -2) @ orient)[5:16]
+    assert (errors[1:-1] > 0.01).all() and (errors < 0.2).all()
+    # An even turn is sure next to grasps, and the surer the shorter it is.
+    assert errors[[1, -2]].max() < 0.7 * errors[5]
+    assert (errors[5] < 0.05) == (angle < 1.0)
+    torch.testing.assert_close(turned_between(found, carrier, GRASPED, 8), found)
 
 
 def test_a_robust_mean_ignores_a_minority() -> None:
