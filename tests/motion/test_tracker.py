@@ -67,6 +67,15 @@ def test_tracks_correct_given_poses_even_gross_ones(filmed: Filmed, wrong: tuple
     assert np.median(np.abs(shell - 1.0)) < 0.05
 
 
+def test_poses_worse_than_any_are_corrected_though_not_thought_so(filmed: Filmed) -> None:
+    egg = filmed.egg
+    given = given_poses(egg, degrees=8.0)
+    found = track_matches(egg.features, egg.matches(overlap=6), filmed.images, filmed.masks, K, given, CONFIG)
+    assert np.degrees(found.turn_sigma) == pytest.approx(CONFIG.most_turn_sigma)
+    assert rotation_errors(given.rotations, egg.rotations).mean() > 5.0
+    assert rotation_errors(found.rotations, egg.rotations).max() < 1.0
+
+
 def test_an_object_without_texture_keeps_its_poses(filmed: Filmed) -> None:
     given = given_poses(filmed.egg)
     found = track_matches([NOTHING] * FRAMES, {}, filmed.images, filmed.masks, K, given, CONFIG)

@@ -38,8 +38,8 @@ _AT_REST = 0.003
 # Pictures say more than estimates, so in the second cut half of a frame's price comes from the masks.
 _ESTIMATE_SHARE = 0.5
 
-# Errors of orientations between grasps, radians: as found; of an even turn at its ends; and what is added half
-# way, as a share of the turn.
+# Errors of orientations between grasps, radians: as found; of an even turn at its ends; and what is added
+# half way, as a share of the turn.
 _FOUND_ERROR, _EVEN_ERROR, _WAY_ERROR = math.radians(8.0), math.radians(2.0), 0.1
 
 # How badly a hand's outline in poses of some frames [B], which may repeat, disagrees with its masks: [B]

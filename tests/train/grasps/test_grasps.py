@@ -358,8 +358,8 @@ def test_free_frames_are_drawn_to_the_depth_they_are_expected_at() -> None:
 GRASPED = [range(0, 6), range(15, 20)]
 
 
-def turning(angle: float) -> tuple[Tensor, Tensor]:
-    """Orientations of a hand between two grasps, which turns evenly by `angle`, and of the object: [20, 3, 3]."""
+def turning(angle: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Orientations [20, 3, 3] of a hand that turns evenly by `angle` between grasps, and of the object."""
     carrier = axis_angle_to_matrix(torch.linspace(0, 1, 20)[:, None] * torch.tensor([0.3, 1.0, 0.2]))
     u = ((torch.arange(20.0) - 5.0) / 10.0).clamp(0.0, 1.0)
     share = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
