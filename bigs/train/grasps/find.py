@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_axis_angle
@@ -41,6 +42,9 @@ _ESTIMATE_SHARE = 0.5
 # Errors of orientations between grasps, radians: as found; of an even turn at its ends; and what is added
 # half way, as a share of the turn.
 _FOUND_ERROR, _EVEN_ERROR, _WAY_ERROR = math.radians(8.0), math.radians(2.0), 0.1
+# What is found wavers from frame to frame, a hand does not: a standard deviation of so many frames takes that
+# out.
+_JITTER = 1.0
 
 # How badly a hand's outline in poses of some frames [B], which may repeat, disagrees with its masks: [B]
 # squared error per pixel of the hand, NaN in frames whose masks say nothing.
@@ -300,9 +304,10 @@ def turned_between(orient: Tensor, carrier: Tensor, grasps: list[range], longest
         ways = [carrier[between] @ here @ axis_angle_to_matrix(share[:, None] * way) for way in (turn, other)]
         even = min(ways, key=lambda way: float((way - found).square().sum()))
         error = _EVEN_ERROR + _WAY_ERROR * turn.norm() * 4.0 * u * (1.0 - u)
-        weight = _FOUND_ERROR**2 / (_FOUND_ERROR**2 + error**2)
-        apart = matrix_to_axis_angle(found.transpose(-1, -2) @ even)
-        orient[between] = found @ axis_angle_to_matrix(weight[:, None] * apart)
+        weight = error**2 / (_FOUND_ERROR**2 + error**2)
+        apart = matrix_to_axis_angle(even.transpose(-1, -2) @ found)
+        apart = torch.from_numpy(gaussian_filter1d(apart.numpy(), _JITTER, axis=0, mode="nearest"))
+        orient[between] = even @ axis_angle_to_matrix(weight[:, None] * apart)
     return orient
 
 
