@@ -20,6 +20,7 @@ from bigs.geometry.surface import (
     convex_distance,
     distance_to_planes,
     empty_grid,
+    inlier_points,
     silhouette_around_points,
 )
 from bigs.geometry.symmetry import SeenSurface, Symmetry
@@ -31,6 +32,9 @@ from bigs.types import MASK_VALUES
 
 # Fewer points give no surface.
 _MIN_POINTS = 30
+# One stray point moves the convex hull of all: those that bound it have neighbours within this many times the
+# usual distance.
+_STRAY = 2.0
 
 
 def usable_silhouettes(clip: Clip, start: ObjectStart) -> list[int]:
@@ -87,11 +91,12 @@ class ObjectHull:
         """
         distance = self.grid.values.ravel().copy()
         doubtful = np.flatnonzero(distance < config.surface_reach)
-        faces = scipy.spatial.ConvexHull(points)
+        bounding = points[inlier_points(points, factor=_STRAY)]
+        faces = scipy.spatial.ConvexHull(bounding)
         planes = faces.equations
         least = min(config.seen_frames, len(self.views.shown))
         turned = np.ones(len(planes), dtype=bool)
-        for places, facing in _carried(points[faces.simplices].mean(1), planes[:, :3], symmetries):
+        for places, facing in _carried(bounding[faces.simplices].mean(1), planes[:, :3], symmetries):
             turned &= self._frames_facing(places, facing) < least
         corners = self.grid.points()[doubtful]
         if turned.any() and not turned.all():

@@ -70,6 +70,16 @@ def test_the_far_side_lies_where_outlines_end() -> None:
     assert back == pytest.approx(HALF[2], abs=0.006)
 
 
+def test_a_stray_point_does_not_stretch_it() -> None:
+    box = turning_box(25.0, deep=0.004)
+    points = np.concatenate([box.points, [[0.02, 0.0, 0.05]]])
+    normals = np.concatenate([box.normals, [[0.0, 0.0, 1.0]]])
+    alone, beside = (
+        depths(box.closed(CONFIG, *cloud)) for cloud in ((box.points, box.normals), (points, normals))
+    )
+    np.testing.assert_allclose(beside, alone, atol=box.grid.spacing + 1e-9)
+
+
 def test_the_hull_alone_is_deeper() -> None:
     assert depths(turning_box(25.0).grid)[1] > HALF[2] + 0.02
 
