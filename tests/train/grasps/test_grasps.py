@@ -382,6 +382,15 @@ def test_between_grasps_an_even_turn_and_what_was_found_count(angle: float) -> N
     torch.testing.assert_close(turned_between(found, carrier, GRASPED, 8), found)
 
 
+def test_what_wavers_from_frame_to_frame_is_taken_out() -> None:
+    true, carrier = turning(3.0)
+    wavering = 0.2 * (-1.0) ** torch.arange(9)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    found = true.clone()
+    found[6:15] = true[6:15] @ axis_angle_to_matrix(wavering)
+    errors = rotation_angle(true.transpose(-1, -2) @ turned_between(found, carrier, GRASPED, 16))
+    assert errors[7:14].max() < 0.02
+
+
 def test_a_robust_mean_ignores_a_minority() -> None:
     generator = torch.Generator().manual_seed(0)
     good = axis_angle_to_matrix(0.02 * torch.randn(9, 3, generator=generator))

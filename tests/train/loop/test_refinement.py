@@ -69,6 +69,7 @@ def test_a_print_is_split_and_a_tint_is_not(made: tuple[Scene, Evidence]) -> Non
     always_right = shows & (columns.amin(0) > middle + 8.0)
     assert min(always_left.sum(), always_right.sum()) > 20
     per_pixel = found.error / found.pixels.clamp_min(1e-3)
+    # A large one may reach over from the other half.
     assert per_pixel[always_left].median() > 50.0 * per_pixel[always_right].quantile(0.95)
 
     splats = scene.object_splats

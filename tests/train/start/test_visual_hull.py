@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.spatial
@@ -78,6 +80,12 @@ def test_a_stray_point_does_not_stretch_it() -> None:
         depths(box.closed(CONFIG, *cloud)) for cloud in ((box.points, box.normals), (points, normals))
     )
     np.testing.assert_allclose(beside, alone, atol=box.grid.spacing + 1e-9)
+
+
+def test_at_a_high_price_it_ends_at_the_points() -> None:
+    box = turning_box(25.0, deep=0.004)
+    back = depths(box.closed(replace(CONFIG, surface_price=1.0), box.points, box.normals))[1]
+    assert back < 0.004 - HALF[2] + CONFIG.surface_margin + box.grid.spacing
 
 
 def test_the_hull_alone_is_deeper() -> None:
