@@ -14,7 +14,7 @@ from limited_view import limited_view
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.support import seen_samples
-from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.surface import DistanceGrid, convex_distance, extract_mesh
 from bigs.geometry.symmetry import Symmetry
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
@@ -74,6 +74,16 @@ def test_hands_meet_what_a_symmetry_makes_of_the_unseen_side(
     assert not torch.equal(solid, plain.scene.object_distance.values)
     # The mesh waits for the poses that the run finds.
     assert torch.equal(built.scene.object_surface.verts, plain.scene.object_surface.verts)
+
+
+def test_the_far_side_is_not_sought_beyond_what_the_symmetry_carried(
+    one_side: tuple[Clip, ObjectHull, ObjectStart],
+) -> None:
+    _, hull, start = one_side
+    found = complete(hull, start, INITIAL, CompletionConfig())
+    inside = found.surface.points()[found.surface.values.ravel() < 0.0]
+    beyond = convex_distance(inside, np.concatenate([hull.points, found.points]))
+    assert beyond.max() <= INITIAL.surface_margin + 0.5 * found.surface.spacing
 
 
 def test_symmetries_found_earlier_count_if_there_are_none_now(
