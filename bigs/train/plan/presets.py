@@ -130,7 +130,7 @@ _APPEARANCE = OptimizeStage(
 _MOVES = MoveStage(
     name="moves",
     lrs={"hand.orient": 0.02, "hand.pose": 0.03, "hand.ray": 0.004, "hand.depth": 0.006},
-    weights={**_FINGER_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
+    weights={**_FINGER_PRIORS, "acceleration": 0.002, "depth_prior": 1.0},
 )
 # Between grasps nothing carries a hand, and a few frames decide: many steps for them alone. Their depth is
 # read off the size of outlines, which must be right to a fraction of a per cent (see `evidence.INSET`).
@@ -139,7 +139,7 @@ _REGRASP = OptimizeStage(
     step="single-subject",
     steps=90,
     lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
-    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 3.0},
+    weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 1.0},
     image_size=160,
     free_frames=True,
     stop_patience=_SETTLED,
@@ -158,7 +158,7 @@ _PLAUSIBLE_TOGETHER = {
     "fingers_even": 0.06,
     "joint_axes": 2.4,
     "finger_tendons": 0.12,
-    "depth_prior": 12.0,
+    "depth_prior": 4.0,
     "rigid": 0.03,
     **_TOUCH,
     "object_acceleration": 0.005,
