@@ -308,3 +308,17 @@ def test_prices_add_up(waving: Scene) -> None:
 def test_stages_that_cannot_run_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         check_plan(replace(FAST, stages=(*FAST.stages[:2], replace(STAGE, **changes))))
+
+
+def test_an_outline_that_is_seen_whole_tells_depth_against_what_is_expected(waving: Scene) -> None:
+    """A hand swings out by 4 % of its depth between grasps, where neither way nor estimate expects it."""
+    sources, at = pictures_of(waving), torch.tensor([3])
+    poses, off = waving.hand_poses["right"], 0.04
+    start = waving.at(at).hand("right")
+    with torch.no_grad():
+        poses.has_expected_depth[at] = True
+        poses.expected_log_depth[at] = start.wrist[:, 2].log() + off
+    start = start._replace(wrist=start.wrist * torch.tensor(off).exp())
+    trials = Trials(waving, "right", STAGE, sources.evidence(STAGE), sources.mismatch(STAGE))
+    found = trials.fit(at, start, 200).poses.wrist[:, 2].log() - (poses.expected_log_depth[at] - off)
+    assert found.abs() < 0.15 * off
