@@ -18,6 +18,8 @@ __all__ = [
     "cut_patches",
     "default_settings",
     "distances",
+    "finger_costs_backward",
+    "finger_costs_forward",
     "fma_peak_gflops",
     "form_factors",
     "hand_poses_backward",
@@ -239,6 +241,15 @@ def hand_poses_backward(
     arrays: _HandPoses, frames: list[int], carried: _Carried, pulls: list[NDArray[Any] | None]
 ) -> tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...] | None]:
     """Flat gradients of what was learned of frames, and of grasps and what carries them."""
+
+# hand_pose [B, 15, 3, 3], turns [M, 15, 3, 3], bends [2, 2, 4, 15, 3, 3].
+_Fingers = tuple[NDArray[Any], ...]
+
+def finger_costs_forward(arrays: _Fingers) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Unevenness, squared impossible turns and departures from coupled bends, an array of one value each."""
+
+def finger_costs_backward(arrays: _Fingers, pulls: list[float]) -> NDArray[Any]:
+    """Flat gradients of hand_pose from those of the three costs."""
 
 # rotations [B, K, 3, 3], rest_joints [K, 3] or [B, K, 3], root [B, 3].
 _Tree = tuple[NDArray[Any], ...]

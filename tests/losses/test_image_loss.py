@@ -1,15 +1,11 @@
 """The photometric terms and the regularisers, whose values are means of simple expressions."""
 
-import math
-
 import pytest
 import torch
 
-from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.losses.photometric import masked_l1, masked_mse, masked_ssim
 from bigs.losses.regularizers import (
     color_spread,
-    finger_unevenness,
     lbs_deviation,
     scale_size,
     squared_norm,
@@ -81,25 +77,6 @@ def test_lbs_deviation_is_a_squared_frobenius_distance_per_gaussian() -> None:
     weights, target = torch.zeros(4, 16), torch.zeros(4, 16)
     weights[0, 3], target[2, 5] = 0.5, 0.1
     assert lbs_deviation(weights, target).item() == pytest.approx((0.25 + 0.01) / 4)
-
-
-def test_fingers_are_even_if_each_is_the_mean_of_its_neighbours() -> None:
-    """Index, middle, ring and pinky lie side by side, although MANO lists the pinky before the ring."""
-    bent = torch.zeros(2, 15, 3)
-    bent[..., 2] = 0.5
-    assert finger_unevenness(axis_angle_to_matrix(bent)).item() == pytest.approx(0.0, abs=1e-6)
-    for joint, squares in ((1, 1), (4, 5), (10, 5), (7, 1), (13, 0)):
-        one = bent.clone()
-        one[:, joint, 2] += 0.1
-        expected = squares * 2.0 * (1.0 - math.cos(0.1)) / 6.0
-        assert finger_unevenness(axis_angle_to_matrix(one)).item() == pytest.approx(expected, abs=1e-6)
-
-
-def test_finger_unevenness_has_exact_gradients() -> None:
-    pose = 0.4 * torch.randn(3, 15, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert torch.autograd.gradcheck(
-        lambda values: finger_unevenness(axis_angle_to_matrix(values)), pose.requires_grad_()
-    )
 
 
 def test_squared_norm_is_a_mean_over_vectors() -> None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bigs.losses.contact import center_contact, fingers_on_surface, penetration, surface_contact
-from bigs.losses.regularizers import finger_unevenness, impossible_turn, squared_norm, uncoupled_bending
+from bigs.losses.regularizers import squared_norm
 from bigs.losses.temporal import acceleration, pose_steps, velocity
 from bigs.losses.weighted import mean_of
 from bigs.train.loop.step import Step
@@ -29,8 +29,8 @@ def smooth(step: Step) -> Tensor:
 
 
 def joint_acceleration(step: Step) -> Tensor:
-    """Second differences of all joints over time, a mean over hands."""
-    return mean_of(acceleration(joints) for joints in step.joints.values())
+    """Second differences over time of the joints of all hands, which have as many each."""
+    return acceleration(torch.cat(list(step.joints.values()), dim=1)) if step.joints else torch.zeros(())
 
 
 def object_acceleration(step: Step) -> Tensor:
@@ -57,23 +57,17 @@ def pose_prior(step: Step) -> Tensor:
 
 def fingers_even(step: Step) -> Tensor:
     """How unevenly joints bend from the index to the pinky, squared radians, a mean over hands."""
-    return mean_of(finger_unevenness(step.posed_clip.hand(side).hand_pose) for side in step.scene.sides)
+    return mean_of(costs.unevenness for costs in step.finger_costs.values())
 
 
 def joint_axes(step: Step) -> Tensor:
     """How far finger joints turn about axes that they do not have, squared radians, a mean over hands."""
-    return mean_of(
-        impossible_turn(step.posed_clip.hand(side).hand_pose, step.evidence.impossible_turns[side])
-        for side in step.scene.sides
-    )
+    return mean_of(costs.impossible for costs in step.finger_costs.values())
 
 
 def finger_tendons(step: Step) -> Tensor:
     """How far outermost finger joints bend otherwise than their tendons tell, a mean over hands."""
-    return mean_of(
-        uncoupled_bending(step.posed_clip.hand(side).hand_pose, step.evidence.bends[side])
-        for side in step.scene.sides
-    )
+    return mean_of(costs.uncoupled for costs in step.finger_costs.values())
 
 
 def depth_prior(step: Step) -> Tensor:

@@ -169,7 +169,7 @@ def run_stage(
                 loss.backward()
             if stage.free_frames:
                 _spare_grasps(scene)
-            problem = _unbounded_gradient(scene)
+            problem = _unbounded_gradient(scene, optimizer)
         if loss is None or problem is not None:
             where = f"stage {stage.name}, step {state.step}: {problem}"
             if state.retreats == MOST_RETREATS:
@@ -260,14 +260,17 @@ def _first_unbounded(scene: Scene) -> str:
     return ""
 
 
-def _unbounded_gradient(scene: Scene) -> str | None:
-    gradients = {name: p.grad for name, p in scene.named_parameters() if p.grad is not None}
+def _unbounded_gradient(scene: Scene, optimizer: FrameAdam) -> str | None:
     # A sum is finite only if every value is, except for overflow, which is as bad.
-    sums = {name: gradient.sum() for name, gradient in gradients.items()}
-    if not sums or _all_finite(sums.values()):
+    sums = [p.grad.sum() for p in optimizer.parameters() if p.grad is not None]
+    if not sums or _all_finite(sums):
         return None
-    name = next(name for name, total in sums.items() if not torch.isfinite(total))
-    wrong = torch.nonzero(~torch.isfinite(gradients[name]))
+    name, gradient = next(
+        (name, p.grad)
+        for name, p in scene.named_parameters()
+        if p.grad is not None and not torch.isfinite(p.grad.sum())
+    )
+    wrong = torch.nonzero(~torch.isfinite(gradient))
     place = f" at {wrong[0].tolist()}" if len(wrong) else ""
     return f"the gradient of {name} is not finite{place}"
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from bigs.fused.fingers import FingerCosts, finger_costs
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
 from bigs.fused.touch import Touch
 from bigs.geometry.spread import spread
@@ -225,6 +226,18 @@ class Step:
     def joints(self) -> dict[Side, Tensor]:
         """Joints [T, 21, 3] of every hand in every frame of the clip."""
         return {side: self.posed_clip.joints(side) for side in self.scene.sides}
+
+    @cached_property
+    def finger_costs(self) -> dict[Side, FingerCosts]:
+        """What the fingers of every hand cost, a mean over the clip."""
+        return {
+            side: finger_costs(
+                self.posed_clip.hand(side).hand_pose,
+                self.evidence.impossible_turns[side],
+                self.evidence.bends[side],
+            )
+            for side in self.scene.sides
+        }
 
     @cached_property
     def touches(self) -> dict[Side, Touch]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bigs.losses.regularizers import finger_unevenness, impossible_turn, uncoupled_bending
+from bigs.fused.fingers import finger_costs
 from bigs.models.poses import HandFrames, HandPoses
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
@@ -109,9 +109,7 @@ class Trials:
         away = poses.wrist[:, 2].log() - own.expected_log_depth[frames]
         values = (  # in the order of `_PRIORS`
             0.5 * (pose - own.base_pose[frames]).square().sum((-1, -2)).mean(),
-            finger_unevenness(pose),
-            impossible_turn(pose, self._turns),
-            uncoupled_bending(pose, self._bends),
+            *finger_costs(pose, self._turns, self._bends),
             (own.has_expected_depth[frames] * away.square()).mean(),
         )
         priced = (weights.get(name, 0.0) * one for name, one in zip(_PRIORS, values, strict=True))

@@ -20,6 +20,7 @@
 
 mod checks;
 pub mod distance;
+pub mod fingers;
 pub mod groups;
 pub mod hand_poses;
 pub mod joints;

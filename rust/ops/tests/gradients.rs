@@ -1,5 +1,6 @@
-//! Gradients of pictures' terms, and joint trees against finite differences, and refusals.
+//! Gradients of pictures' terms, joint trees and costs of fingers against finite differences, and refusals.
 
+use bigs_ops::fingers::{Costs, Fingers};
 use bigs_ops::joints::{Tree, rotations, rotations_vjp};
 use bigs_ops::pixels::{Frames, alone::Alone, together::Together};
 
@@ -195,4 +196,37 @@ fn joint_trees() {
         root: threes(&root[..3]),
     };
     assert!(backwards.pose().unwrap_err().to_string().starts_with("parents"));
+}
+
+#[test]
+fn costs_of_fingers() {
+    let turns = rotations(threes(&random(1, 90))).as_flattened().to_vec();
+    let signed = |seed, count| -> Vec<f64> { random(seed, count).iter().map(|v| 2.0 * v - 1.0).collect() };
+    let (impossible, bends) = (signed(2, 3 * 135), signed(3, 16 * 135));
+    let v = Costs {
+        unevenness: 0.7,
+        impossible: -0.2,
+        uncoupled: 1.3,
+    };
+    let fingers = |turns: &[f64]| {
+        let fingers = Fingers {
+            rotations: nines(turns),
+            impossible: nines(&impossible),
+            bends: nines(&bends),
+        };
+        let costs = fingers.costs().unwrap();
+        let loss =
+            v.unevenness * costs.unevenness + v.impossible * costs.impossible + v.uncoupled * costs.uncoupled;
+        (loss, fingers.vjp(v).unwrap())
+    };
+    let (_, found) = fingers(&turns);
+    check("hand_pose", found.as_flattened(), &|i, h| {
+        fingers(&changed(&turns, i, h)).0
+    });
+    let short = Fingers {
+        rotations: nines(&turns[..9]),
+        impossible: nines(&impossible),
+        bends: nines(&bends),
+    };
+    assert!(short.costs().unwrap_err().to_string().starts_with("hand_pose"));
 }

@@ -3,6 +3,7 @@
 mod bundle;
 mod call;
 mod convert;
+mod fingers;
 mod hand_poses;
 mod measure;
 mod occlusion;
@@ -331,6 +332,8 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(poses::rotations_backward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_forward, m)?)?;
     m.add_function(wrap_pyfunction!(poses::tree_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(fingers::finger_costs_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(fingers::finger_costs_backward, m)?)?;
     m.add_function(wrap_pyfunction!(occlusion::form_factors, m)?)?;
     m.add_function(wrap_pyfunction!(touch::distances, m)?)?;
     m.add_function(wrap_pyfunction!(touch::touch_forward, m)?)?;
