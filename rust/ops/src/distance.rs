@@ -80,9 +80,8 @@ impl<T: Real> Sampler<'_, T> {
             let inside = p[i].limit(lower[i], upper[i]);
             beyond[i] = p[i] - inside;
             let place = (inside - lower[i]) * self.steps[i];
-            // A place on a value counts to the cell before it. A point that is not finite reads any value; its own
-            // distance is not finite either.
-            first[i] = (place.ceiling().saturating_sub(1) as usize).min(size[i] - 2);
+            // A point that is not finite reads the first value; its own distance is not finite either.
+            first[i] = (place.as_f64() as usize).min(size[i] - 2);
             share[i] = place - T::of(first[i] as f64);
             // Where the point is moved to the box, the value does not change with it.
             per[i] = if beyond[i] == T::ZERO {
