@@ -44,18 +44,9 @@ pub struct Costs<T> {
 type Form<'a, T> = Vec<(usize, &'a [T; 9])>;
 
 fn forms<T: Real>(rows: &[[T; 9]]) -> Vec<Form<'_, T>> {
-    let of_row = |row: &'_ [[T; 9]]| -> Vec<usize> {
-        (0..JOINTS)
-            .filter(|&joint| row[joint].iter().any(|&c| c != T::ZERO))
-            .collect()
-    };
+    let counts = |coefficients: &[T; 9]| coefficients.iter().any(|&c| c != T::ZERO);
     rows.chunks_exact(JOINTS)
-        .map(|row| {
-            of_row(row)
-                .into_iter()
-                .map(|joint| (joint, &row[joint]))
-                .collect()
-        })
+        .map(|row| row.iter().enumerate().filter(|(_, c)| counts(c)).collect())
         .collect()
 }
 
@@ -105,10 +96,10 @@ impl<T: Real> Bend<T> {
         })
     }
 
-    /// Adds the gradient of the angle to those of its two functions' pose.
+    /// Adds the pose's gradient from that of the angle.
     fn pull(&self, v: T, [sine, cosine]: [&Form<'_, T>; 2], v_pose: &mut [[T; 9]]) {
         let square = self.sine * self.sine + self.cosine * self.cosine;
-        // No angle, and no gradient.
+        // Of two zeros there is no angle.
         if square != T::ZERO {
             add_form(sine, v * self.cosine / square, v_pose);
             add_form(cosine, -v * self.sine / square, v_pose);
