@@ -35,6 +35,9 @@ def finger_costs(hand_pose: Tensor, turns: Tensor, bends: Tensor) -> FingerCosts
         hand_pose: rotations [B, 15, 3, 3] in MANO's joint order.
         turns: [M, 15, 3, 3], see `hand.impossible_turns`; no gradient.
         bends: [2, 2, 4, 15, 3, 3], see `hand.bends`; no gradient.
+
+    Raises:
+        ValueError: a shape that does not fit.
     """
     return FingerCosts(*_FingerCosts.apply(hand_pose, turns, bends))
 

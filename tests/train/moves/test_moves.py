@@ -13,6 +13,7 @@ from torch import Tensor
 from toy_scenes import cube_scene
 
 from bigs.checks import InputError
+from bigs.fused.fingers import finger_costs
 from bigs.geometry.rotations import axis_angle_to_matrix, rotation_angle
 from bigs.hand import HandModel
 from bigs.models.hand_splats import silhouette_hand
@@ -291,6 +292,10 @@ def test_prices_add_up(waving: Scene) -> None:
         torch.testing.assert_close(tried.mismatch, mismatch("right", bent, ALL))
         prices[name] = tried.price - tried.mismatch
     torch.testing.assert_close(prices["pose_prior"], torch.full((FRAMES,), 0.01), atol=1e-4, rtol=0)
+    evidence = sources.evidence(STAGE)
+    costs = finger_costs(bent.hand_pose, evidence.impossible_turns["right"], evidence.bends["right"])
+    for name, cost in zip(("fingers_even", "joint_axes", "finger_tendons"), costs, strict=True):
+        torch.testing.assert_close(prices[name].mean(), cost, atol=1e-5, rtol=1e-3)
     every = Trials(waving, "right", STAGE, sources.evidence(STAGE), mismatch).price(ALL, bent)
     expected = sum(STAGE.weights[name] * price for name, price in prices.items())
     torch.testing.assert_close(every.price - every.mismatch, expected, atol=1e-5, rtol=1e-4)

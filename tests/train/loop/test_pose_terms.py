@@ -1,0 +1,47 @@
+"""Terms of poses are means over both hands, of which each is asked."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bigs.fused.fingers import finger_costs
+from bigs.losses.temporal import acceleration
+from bigs.models.scene import Scene
+from bigs.train.loop.step import Evidence, Selection, Step
+from bigs.train.loop.terms import TERMS
+from bigs.types import Side
+
+
+@pytest.fixture
+def moving(scene: Scene) -> Scene:
+    """Both hands bend and swing, the left one more."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for bend, poses in zip((0.2, 0.5), scene.hand_poses.values(), strict=True):
+            poses.pose += bend * torch.randn(poses.pose.shape, generator=generator)
+            poses.orient += bend * torch.randn(poses.orient.shape, generator=generator)
+    return scene
+
+
+def of_side(name: str, scene: Scene, evidence: Evidence, side: Side) -> Tensor:
+    clip = scene.at(torch.arange(scene.n_frames))
+    if name == "acceleration":
+        return acceleration(clip.joints(side))
+    costs = finger_costs(clip.hand(side).hand_pose, evidence.impossible_turns[side], evidence.bends[side])
+    return {
+        "fingers_even": costs.unevenness,
+        "joint_axes": costs.impossible,
+        "finger_tendons": costs.uncoupled,
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["fingers_even", "joint_axes", "finger_tendons", "acceleration"])
+def test_a_term_is_the_mean_of_what_it_says_of_each_hand(
+    moving: Scene, evidence: Evidence, name: str
+) -> None:
+    right, left = (of_side(name, moving, evidence, side) for side in moving.sides)
+    assert left > 1.2 * right > 0
+    found = TERMS[name](Step(moving, evidence, {}, Selection(torch.arange(moving.n_frames))))
+    torch.testing.assert_close(found, (right + left) / 2)
