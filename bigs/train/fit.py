@@ -69,6 +69,10 @@ class FitReport:
     # Seconds of the interrupted runs that this one continues; `seconds` includes them.
     before: float = 0.0
 
+    def spare(self, what: str, seconds: float) -> None:
+        """Count seconds that were not spent on something."""
+        self.spared[what] = self.spared.get(what, 0.0) + seconds
+
 
 class Waypoint(NamedTuple):
     """How far a run has come."""
@@ -80,6 +84,7 @@ class Waypoint(NamedTuple):
 # What is spared, in the words of the report.
 _FROZEN = "fields that a stage does not train, in all of its steps but one"
 _SETTLED = "steps of stages whose loss had settled"
+_OUTSIDE = "of every picture, where hands and object never are"
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
 Listener = Callable[[dict[str, Any]], None]
@@ -237,7 +242,7 @@ def fit(
             if last.step < stage.steps:
                 left = stage.steps - last.step
                 saved = watch.read()[stage.name] / last.step * left
-                report.spared[_SETTLED] = report.spared.get(_SETTLED, 0.0) + saved
+                report.spare(_SETTLED, saved)
                 report.skipped.append(
                     f"{stage.name}: {left} of {stage.steps} steps, the loss had settled ({saved:.1f} s saved)"
                 )
@@ -248,10 +253,12 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
-    left_out = [f"{what} ({seconds:.2g} s)" for what, seconds in report.spared.items() if seconds > 0.0]
-    share = targets.cropped()
-    if share < 1.0:
-        left_out.append(f"{1.0 - share:.0%} of every picture, where hands and object never are")
+    shares = {_OUTSIDE: f"{1.0 - targets.cropped():.0%} "}
+    left_out = [
+        f"{shares.get(what, '')}{what} ({seconds:.2g} s)"
+        for what, seconds in report.spared.items()
+        if seconds > 0.0
+    ]
     if left_out:
         report.facts["left out"] = ", ".join(left_out)
     report.facts |= finish_mesh(scene, start, sources, config, report.completed)
@@ -330,7 +337,8 @@ def _optimise(
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
         told = progress._asdict()
-        report.spared[_FROZEN] = report.spared.get(_FROZEN, 0.0) + told.pop("spared")
+        report.spare(_FROZEN, told.pop("fields_spared"))
+        report.spare(_OUTSIDE, told.pop("pixels_spared"))
         listen({"event": "step", "stage": stage.name, **told, "index": index})
         if progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             keep(index, state)

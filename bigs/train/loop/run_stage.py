@@ -18,6 +18,7 @@ from bigs.models.scene import Scene
 from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.density import Pull, densified
 from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_rates
+from bigs.train.loop.outside import seconds_outside
 from bigs.train.loop.step import Evidence, Selection, Step
 from bigs.train.loop.terms import Term, terms_of
 from bigs.train.plan.config import OptimizeStage
@@ -33,7 +34,8 @@ class StageProgress(NamedTuple):
     terms: dict[str, float]
     loss: float
     seconds: float  # of this step
-    spared: float  # seconds that it would have taken to evaluate fields that the stage does not train
+    fields_spared: float  # seconds that it would have taken to evaluate fields that the stage does not train
+    pixels_spared: float  # seconds that pixels in which nothing ever is would have taken
 
 
 class StageState(NamedTuple):
@@ -143,7 +145,8 @@ def run_stage(
     with torch.no_grad():
         # A frozen field is evaluated once for the whole stage.
         fixed = scene.canonical(frozen) if needs_canonical else {}
-    once, spared = time.perf_counter() - began if fixed else 0.0, 0.0
+    once, fields_spared = time.perf_counter() - began if fixed else 0.0, 0.0
+    pixels_spared: float | None = None
 
     kept = _Kept(scene, state)
     while state.step < stage.steps and not _has_settled(stage, state):
@@ -184,6 +187,8 @@ def run_stage(
             state = _densify(scene, step, densify, stage.steps, state)
         if state.step % keep_every == 0:
             kept = _Kept(scene, state)
+        if pixels_spared is None:
+            pixels_spared = seconds_outside(step)
         after_step(
             StageProgress(
                 state.step,
@@ -191,11 +196,12 @@ def run_stage(
                 dict(zip(values, torch.stack(list(values.values())).tolist(), strict=True)),
                 float(loss.detach()),
                 time.perf_counter() - began,
-                spared,
+                fields_spared,
+                pixels_spared,
             ),
             state,
         )
-        spared = once
+        fields_spared = once
     return state
 
 

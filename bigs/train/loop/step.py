@@ -64,6 +64,8 @@ class Step:
     evidence: Evidence
     canonical: dict[Entity, CanonicalHand | CanonicalObject]  # of the selection's entities
     selection: Selection
+    # Views and channels of each rendering made so far.
+    pictures: list[tuple[int, int]] = field(default_factory=list)
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
     _alone_terms: dict[Entity, AloneTerms] = field(default_factory=dict)
 
@@ -75,6 +77,12 @@ class Step:
     def entities(self) -> tuple[Entity, ...]:
         """The subjects that are rendered."""
         return self.selection.entities
+
+    @property
+    def whole_size(self) -> Tensor:
+        """Width and height [2] of the clip's whole image in pixels of this stage's size."""
+        zoom = self.evidence.targets.K.diagonal()[:2] / self.scene.K.diagonal()[:2]
+        return zoom * zoom.new_tensor([self.scene.width, self.scene.height])
 
     @property
     def frames(self) -> Tensor:
@@ -134,6 +142,7 @@ class Step:
     def render(self, gaussians: Gaussians, means2d: Means2d = "values") -> RenderOutput:
         """Render B frames on black: colours [B, H, W, D], alphas [B, H, W, 1]."""
         targets = self.evidence.targets
+        self.pictures.append((len(gaussians.means), gaussians.colors.shape[-1]))
         out = rasterization(
             *gaussians,
             torch.eye(4)[None],
@@ -169,9 +178,7 @@ class Step:
         if "object" not in self._alone:
             return None
         info = self._alone["object"].info
-        # The clip's whole image in pixels of this stage's size.
-        zoom = self.evidence.targets.K.diagonal()[:2] / self.scene.K.diagonal()[:2]
-        size = zoom * zoom.new_tensor([self.scene.width, self.scene.height])
+        size = self.whole_size
         # Image terms average over the object's pixels in all views, and over the subjects.
         average = len(self.entities) * self.share_alone("object").sum() / size.prod()
         on_screen = average * 0.5 * size * info["means2d"].grad.squeeze(1)

@@ -248,7 +248,7 @@ def test_frozen_fields_are_evaluated_once(
     run_stage(scene, stage, evidence, 0, after_step=lambda progress, state: told.append(progress))
     assert calls == expected
     # The first step pays for all.
-    spared = [progress.spared for progress in told]
+    spared = [progress.fields_spared for progress in told]
     assert spared[0] == 0.0 and len(set(spared[1:])) == 1
     assert (spared[1] > 0.0) == (1 in expected.values())
 
