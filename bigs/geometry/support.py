@@ -9,7 +9,7 @@ import scipy.spatial
 
 from bigs.geometry.coverage import ObjectViews, times_seen
 from bigs.geometry.mesh import sample_surface
-from bigs.geometry.surface import DistanceGrid, extract_mesh
+from bigs.geometry.surface import DistanceGrid
 from bigs.threads import thread_count
 
 # Number of surface samples that are tested, and of those that may occlude them.
@@ -25,20 +25,17 @@ class SurfaceSamples(NamedTuple):
 
 
 def seen_samples(
-    views: ObjectViews, surface: DistanceGrid, least_frames: int, tolerance: float
+    views: ObjectViews, verts: np.ndarray, faces: np.ndarray, least_frames: int, tolerance: float
 ) -> SurfaceSamples:
-    """Samples of a surface, and which of them show in enough frames.
+    """Samples of a closed surface, and which of them show in enough frames.
 
     Args:
         views: the frames that count.
-        surface: signed distances.
+        verts: [V, 3] metres.
+        faces: [F, 3].
         least_frames: frames that must show a sample, or all if there are fewer.
         tolerance: metres by which poses are wrong; surface that is nearer by less does not hide.
-
-    Raises:
-        ValueError: there is no surface.
     """
-    verts, faces = extract_mesh(surface)
     occluders, _ = sample_surface(verts, faces, _OCCLUDERS)
     points, normals = sample_surface(verts, faces, _SAMPLES)
     frames = times_seen(views, points, normals, occluders, tolerance)

@@ -253,11 +253,11 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
-    shares = {_OUTSIDE: f"{1.0 - targets.cropped():.0%} "}
+    outside = 1.0 - targets.cropped()
     left_out = [
-        f"{shares.get(what, '')}{what} ({seconds:.2g} s)"
+        f"{outside:.0%} {what} ({seconds:.2g} s)" if what == _OUTSIDE else f"{what} ({seconds:.2g} s)"
         for what, seconds in report.spared.items()
-        if seconds > 0.0
+        if (outside if what == _OUTSIDE else seconds) > 0.0
     ]
     if left_out:
         report.facts["left out"] = ", ".join(left_out)

@@ -21,14 +21,17 @@ _TRIES = 2
 def seconds_outside(step: Step) -> float:
     """Seconds that a finished step would have spent on pixels outside its targets' box, with their gradients.
 
-    Measured on as many pictures of the same width, as high as the pixels left out fill, that show nothing
-    and are compared with nothing. That is the least those pixels could cost.
+    Measured on as many pictures that show nothing and are compared with nothing, the least that pixels could
+    cost: what those with the pixels outside take longer than those without. They are as wide as the box.
     """
-    targets = step.evidence.targets
-    rows = round(step.whole_size.prod().item() / targets.width) - targets.height
-    if rows <= 0:
+    inside = step.evidence.targets.height
+    whole = round(step.whole_size.prod().item() / step.evidence.targets.width)
+    if whole <= inside:
         return 0.0
-    return sum(_seconds_of_nothing(step, rows, *picture) for picture in step.pictures)
+    return sum(
+        max(_seconds_of_nothing(step, whole, *picture) - _seconds_of_nothing(step, inside, *picture), 0.0)
+        for picture in step.pictures
+    )
 
 
 def _seconds_of_nothing(step: Step, rows: int, views: int, channels: int) -> float:

@@ -169,7 +169,7 @@ def _object_surfaces(
         why = f"object surface from masks: {reason}; using the points' convex hull instead"
         return _ObjectSurfaces(closed, None, grid, [], [why])
     support = Support(
-        seen_samples(hull.views, grid, initial.seen_frames, initial.seen_tolerance), hull.points
+        seen_samples(hull.views, *closed, initial.seen_frames, initial.seen_tolerance), hull.points
     )
     verts, faces = support.known_part(*closed, initial.surface_kept)
     left_out = 1.0 - face_areas(closed[0][verts], faces).sum() / face_areas(*closed).sum()

@@ -10,7 +10,7 @@ import scipy.spatial
 
 from bigs.geometry.coverage import times_empty
 from bigs.geometry.support import seen_samples
-from bigs.geometry.surface import DistanceGrid
+from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import find_symmetries
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
@@ -63,7 +63,9 @@ def complete(
             the evidence is not strong for any now.
     """
     plain = hull.closed(initial, hull.points, hull.normals)
-    points, normals, seen = seen_samples(hull.views, plain, initial.seen_frames, initial.seen_tolerance)
+    points, normals, seen = seen_samples(
+        hull.views, *extract_mesh(plain), initial.seen_frames, initial.seen_tolerance
+    )
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
         return replace(nothing, why_not=f"{nothing.seen:.0%} of the object's surface was seen")

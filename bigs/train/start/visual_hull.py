@@ -47,6 +47,19 @@ def usable_silhouettes(clip: Clip, start: ObjectStart) -> list[int]:
     return trusted if len(trusted) >= min(len(shown), 5) else shown
 
 
+def usable_views(clip: Clip, start: ObjectStart) -> ObjectViews | None:
+    """The frames whose silhouette may carve the object; None without any."""
+    usable = usable_silhouettes(clip, start)
+    return _views_at(clip, start, usable)[0] if usable else None
+
+
+def _views_at(clip: Clip, start: ObjectStart, frames: list[int]) -> tuple[ObjectViews, np.ndarray]:
+    """Some of the clip's frames, and their labels [F, H, W]."""
+    labels = np.stack(side_by_side(clip.mask, frames))
+    rotations, centers = start.rotations[frames].numpy(), start.centers[frames].numpy()
+    return ObjectViews(labels == MASK_VALUES["object"], clip.K, rotations, centers), labels
+
+
 def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
     """The fallback: the convex hull of the points.
 
@@ -149,11 +162,11 @@ def find_object_hull(
     usable = usable_silhouettes(clip, start)
     if not usable:
         raise ValueError("no frame shows the object")
+    views, labels = _views_at(clip, start, usable)
     size = (start.points.max(0) - start.points.min(0)).max()
     lower, upper = start.points.min(0) - 0.25 * size, start.points.max(0) + 0.25 * size
     grid = empty_grid(lower, upper, config.surface_resolution)
-    labels = np.stack(side_by_side(clip.mask, usable))
-    rotations, centers = start.rotations[usable].numpy(), start.centers[usable].numpy()
+    rotations, centers = views.rotations, views.centers
     # Anything but background may hide the object, so the object may be there.
     allowed = (labels != 0) | unknown[usable]
 
@@ -169,7 +182,6 @@ def find_object_hull(
     points = start.points[hull.distance(start.points) < 0.25 * config.surface_reach]
     if len(points) < _MIN_POINTS:
         raise ValueError(f"only {len(points)} of {len(start.points)} points lie inside the silhouettes")
-    views = ObjectViews(labels == MASK_VALUES["object"], clip.K, rotations, centers)
     return ObjectHull(
         DistanceGrid(distance.reshape(grid.values.shape), grid.origin, grid.spacing),
         points,

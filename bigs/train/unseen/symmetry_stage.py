@@ -14,6 +14,7 @@ from bigs.data.base import Clip
 from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import face_areas, frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
+from bigs.geometry.support import seen_samples
 from bigs.geometry.surface import extract_mesh
 from bigs.geometry.symmetry import SeenSurface, Symmetry, completed
 from bigs.models.canonical import CanonicalObject
@@ -25,7 +26,7 @@ from bigs.train.plan.config import CompletionStage
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.completion import Completion, complete
 from bigs.train.start.initial import ObjectStart, object_in_camera
-from bigs.train.start.visual_hull import find_object_hull
+from bigs.train.start.visual_hull import find_object_hull, usable_views
 from bigs.train.unseen.visibility import (
     SHOWS,
     frames_seen,
@@ -76,14 +77,19 @@ def complete_scene(
         earlier: see `complete`.
     """
     scene.requires_grad_(False)
+    start = _at_final_poses(scene, clip, initial)
+    seen = _share_seen(scene, clip, start, initial)
+    # Where that much was seen, the surface made anew would say the same.
+    if seen >= completion.enough:
+        return StageOutcome(f"{seen:.0%} of the object's surface was seen", _seen_fact(seen))
     canonical = scene.object_splats()
-    start = _at_final_poses(scene, clip, evidence, initial)
+    start = start._replace(colors=_colors_found(canonical, scene, evidence, start.points))
     try:
         hull = find_object_hull(clip, unknown, start, initial)
         found = complete(hull, start, initial, completion, earlier)
     except (ValueError, scipy.spatial.QhullError) as reason:
         return StageOutcome(f"masks and points give no surface: {reason}", {})
-    facts = {"object seen": f"{found.seen:.0%} of its surface"}
+    facts = _seen_fact(found.seen)
     if not found.symmetries:
         return StageOutcome(str(found), facts)
     frames = guard_frames(scene.n_frames)
@@ -112,16 +118,34 @@ def complete_scene(
     return StageOutcome(None, facts)
 
 
-def _at_final_poses(scene: Scene, clip: Clip, evidence: Evidence, initial: InitialConfig) -> ObjectStart:
-    """The clip's points in the poses and with the colours that were found."""
-    canonical = scene.object_splats()
+def _at_final_poses(scene: Scene, clip: Clip, initial: InitialConfig) -> ObjectStart:
+    """The clip's points in the poses that were found."""
+    start = object_in_camera(clip, initial)
+    pose = scene.at(torch.arange(scene.n_frames)).object
+    return start._replace(rotations=pose.rotations, centers=pose.centers / pose.scale)
+
+
+def _share_seen(scene: Scene, clip: Clip, start: ObjectStart, initial: InitialConfig) -> float:
+    """How much of the surface that the scene has by now was seen, in the frames and poses of `start`."""
+    views = usable_views(clip, start)
+    if views is None:
+        return 0.0
+    surface = scene.object_surface.verts.numpy(), scene.object_surface.faces.numpy()
+    return float(seen_samples(views, *surface, initial.seen_frames, initial.seen_tolerance).seen.mean())
+
+
+def _seen_fact(share: float) -> dict[str, str]:
+    return {"object seen": f"{share:.0%} of its surface"}
+
+
+def _colors_found(
+    canonical: CanonicalObject, scene: Scene, evidence: Evidence, points: np.ndarray
+) -> np.ndarray:
+    """The colours [M, 3] that the clip showed at points [M, 3] of the object."""
     shown = frames_seen(canonical, object_views(scene, evidence)) > 0
     if not shown.any():
         shown[:] = True
-    start = object_in_camera(clip, initial)
-    pose = scene.at(torch.arange(scene.n_frames)).object
-    colors = blended_colors(canonical, shown, start.points)
-    return start._replace(rotations=pose.rotations, centers=pose.centers / pose.scale, colors=colors)
+    return blended_colors(canonical, shown, points)
 
 
 def blended_colors(canonical: CanonicalObject, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -118,10 +118,10 @@ def test_less_counts_as_seen_the_more_frames_must_show_it(
     one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
     _, hull, _ = one_side
-    surface = hull.closed(INITIAL, hull.points, hull.normals)
-    shares = [seen_samples(hull.views, surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
+    surface = extract_mesh(hull.closed(INITIAL, hull.points, hull.normals))
+    shares = [seen_samples(hull.views, *surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
     assert shares[0] > shares[1] > shares[2] > 0.0
-    assert seen_samples(hull.views, surface, 3, 0.0).seen.mean() < shares[1]
+    assert seen_samples(hull.views, *surface, 3, 0.0).seen.mean() < shares[1]
 
 
 def test_weak_evidence_changes_nothing(one_side: tuple[Clip, ObjectHull, ObjectStart]) -> None:

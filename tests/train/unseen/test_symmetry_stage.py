@@ -71,7 +71,7 @@ def shape(scene: Scene, truth: HandObjectTrajectory) -> ShapeScore:
 
 def test_off_there_is_no_such_stage(plain: tuple[Scene, FitReport]) -> None:
     assert CompletionStage().name not in plain[1].seconds
-    assert plain[1].skipped == [] and set(plain[1].facts) == {"left out", "object mesh"}
+    assert plain[1].skipped == [] and set(plain[1].facts) == {"object mesh"}
 
 
 def test_the_shape_gains_and_nothing_that_was_seen_changes(
@@ -162,6 +162,22 @@ def test_where_it_does_not_help_the_scene_is_as_if_it_were_off(
     before, after = plain[0].state_dict(), scene.state_dict()
     assert before.keys() == after.keys()
     assert same(before, after, ("",))
+
+
+def test_what_was_seen_is_told_without_a_hull(
+    bottle: tuple[Clip, HandObjectTrajectory],
+    completed: tuple[Scene, FitReport],
+    both_hands: dict[Side, HandModel],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The surface at hand and the one made anew say the same of what was seen; the first says it sooner."""
+    enough = replace(PLAN, prior=PriorConfig("symmetry", completion=CompletionConfig(enough=0.05)))
+    made: list[str] = []
+    monkeypatch.setattr("bigs.train.unseen.symmetry_stage.find_object_hull", lambda *a: made.append("hull"))
+    _, report = fit(bottle[0], both_hands, enough)
+    told, remade = (int(facts["object seen"].split("%")[0]) for facts in (report.facts, completed[1].facts))
+    assert report.skipped == [f"object-completion: {told}% of the object's surface was seen"]
+    assert abs(told - remade) <= 3 and made == []
 
 
 def test_a_completed_object_comes_back_from_its_checkpoint(
