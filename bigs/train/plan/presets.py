@@ -109,7 +109,7 @@ _CONTACT = OptimizeStage(
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
-    steps=60,
+    steps=40,
     lrs={
         "hand.triplane": 1e-2,
         "hand.appearance": 2e-3,
@@ -281,7 +281,7 @@ DEMO = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=40),
-        replace(_APPEARANCE, steps=40),
+        _APPEARANCE,
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=40),
         _MOVES,
@@ -311,7 +311,7 @@ FULL = replace(
         ScaleSearchStage(),
         GraspStage(),
         _GRASPED,
-        replace(_APPEARANCE, steps=200),
+        replace(_APPEARANCE, steps=80),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
