@@ -21,20 +21,19 @@ _TRIES = 2
 def seconds_outside(step: Step) -> float:
     """Seconds that a finished step would have spent on pixels outside its targets' box, with their gradients.
 
-    Measured on as many pictures that show nothing and are compared with nothing, the least that pixels could
-    cost: what those with the pixels outside take longer than those without. They are as wide as the box.
+    They are the share that lies outside of what whole pictures would cost that show nothing and are compared
+    with nothing. This is measured on as many as the step made, and is the least that pixels could cost.
     """
-    inside = step.evidence.targets.height
-    whole = round(step.whole_size.prod().item() / step.evidence.targets.width)
-    if whole <= inside:
+    targets = step.evidence.targets
+    whole = round(step.whole_size.prod().item() / targets.width)
+    if whole <= targets.height:
         return 0.0
-    return sum(
-        max(_seconds_of_nothing(step, whole, *picture) - _seconds_of_nothing(step, inside, *picture), 0.0)
-        for picture in step.pictures
-    )
+    outside = 1.0 - targets.height / whole
+    return outside * sum(_seconds_of_nothing(step, whole, *picture) for picture in step.pictures)
 
 
 def _seconds_of_nothing(step: Step, rows: int, views: int, channels: int) -> float:
+    """Seconds of `views` pictures as wide as the box."""
     width = step.evidence.targets.width
     black = torch.zeros(views, rows, width)
     nowhere = Targets(black.new_zeros(*black.shape, 3), {}, black, step.evidence.targets.K, width, rows)

@@ -59,10 +59,9 @@ def test_every_picture_counts_with_what_it_leaves_out(
     monkeypatch.setattr("bigs.train.loop.outside.time", SimpleNamespace(perf_counter=lambda: clock.now))
     before = {name: p.grad.clone() for name, p in scene.named_parameters() if p.grad is not None}
     # A row takes a second here.
-    assert seconds_outside(step) == 12 * len(channels)
-    # Each twice, of which the shorter counts; no Gaussians; all 30 rows, and the 18 that are looked at.
-    expected = [(2, 0, count, 40, rows) for count in channels for rows in (30, 18)]
-    assert drawn[::2] == drawn[1::2] == expected
+    assert seconds_outside(step) == pytest.approx(12 * len(channels))
+    # Each twice, of which the shorter counts; no Gaussians; all 30 rows, of which 12 are not looked at.
+    assert drawn[::2] == drawn[1::2] == [(2, 0, count, 40, 30) for count in channels]
     # Nothing reaches the scene.
     assert all(torch.equal(p.grad, before[name]) for name, p in scene.named_parameters() if name in before)
 
@@ -79,5 +78,5 @@ def test_every_step_of_a_stage_spares_the_same(
     stage = replace(stage, steps=3)
     run_stage(scene, stage, upper(evidence, 18), 0, after_step=lambda progress, state: told.append(progress))
     assert len(told) == 3
-    assert told[0].pixels_spared >= 0.0
+    assert told[0].pixels_spared > 0.0
     assert len({progress.pixels_spared for progress in told}) == 1
