@@ -42,17 +42,22 @@ class ObjectDetail(FreeGaussians):
 
 @torch.no_grad()
 def split_object(
-    whole: CanonicalObject, parts: int | Tensor, least_opacity: float, freedom: Tensor | None = None
+    whole: CanonicalObject,
+    parts: int | Tensor,
+    least_opacity: float,
+    freedom: Tensor | None = None,
+    overlap: float = 1.0,
 ) -> ObjectDetail:
     """Every Gaussian as `parts` x `parts` smaller ones in the plane of its first two axes.
 
-    They stand where the parts of its share of the surface lie, and are as much smaller.
+    They stand where the parts of its share of the surface lie, and are as much smaller, times `overlap`.
 
     Args:
         whole: the object, N Gaussians.
         parts: along each of the two axes, for all or for each [N]; 1 only prunes.
         least_opacity: Gaussians that are less opaque than this are left out.
         freedom: [N] in [0, 1], the factor on what the parts of each learn from now on; 1 if not given.
+        overlap: how many times as wide as that the parts are; what stays whole stays as it is.
 
     Raises:
         InputError: none is as opaque as that.
@@ -69,7 +74,8 @@ def split_object(
     place = (torch.stack([rank // along, rank % along], dim=-1) + 0.5) / along[:, None] - 0.5  # [P, 2]
     quats, scales = whole.quats[index], whole.scales[index]
     axes = quat_to_matrix(quats)[..., :2] * (scales[:, None, :2] / _SIGMA_PER_SPACING)  # [P, 3, 2]
-    smaller = torch.stack([1.0 / along, 1.0 / along, torch.ones(len(index))], dim=-1)
+    width = torch.where(along > 1, overlap / along, 1.0)
+    smaller = torch.stack([width, width, torch.ones(len(index))], dim=-1)
 
     detail = ObjectDetail(len(index))
     detail.start(

@@ -81,6 +81,9 @@ class Waypoint(NamedTuple):
     step: int | None  # steps of the stage done; None at its end
 
 
+# A Gaussian less free than this stays whole: its parts would hardly learn to close the gaps between them.
+_LEARNS = 0.5
+
 # What is spared, in the words of the report.
 _FROZEN = "fields that a stage does not train, in all of its steps but one"
 _SETTLED = "steps of stages whose loss had settled"
@@ -307,7 +310,10 @@ def _split(scene: Scene, stage: SplitStage, sources: EvidenceSource) -> list[str
     if scene.object_splats is not None:
         with torch.no_grad():
             whole = scene.object_splats()
-        scene.object_splats = split_object(whole, stage.parts, stage.least_opacity, freedom["object"])
+        parts = torch.where(freedom["object"] < _LEARNS, 1, stage.parts)
+        scene.object_splats = split_object(
+            whole, parts, stage.least_opacity, freedom["object"], stage.overlap
+        )
         notes.append(_become(len(whole.means), scene.object_splats))
     return notes
 

@@ -70,6 +70,17 @@ def test_each_has_as_many_parts_as_it_is_told() -> None:
             )
 
 
+def test_parts_overlap_and_what_stays_whole_does_not() -> None:
+    whole = plate()
+    parts = torch.arange(len(whole.means)) % 2 + 1
+    plain, wide = (split_object(whole, parts, 0.0, overlap=overlap)() for overlap in (1.0, 1.5))
+    split = (parts == 2).repeat_interleave(parts.square())
+    factor = torch.tensor([1.5, 1.5, 1.0])
+    torch.testing.assert_close(wide.scales[split], plain.scales[split] * factor)
+    assert torch.equal(wide.scales[~split], plain.scales[~split])
+    assert torch.equal(wide.means, plain.means)
+
+
 def test_what_cannot_be_seen_is_pruned() -> None:
     whole = plate()
     opacities = whole.opacities.clone()

@@ -142,8 +142,11 @@ class SplitStage:
 
     name: str = "split"
     step: StepKind = "single-subject"
-    # Each Gaussian of the object is split into parts x parts smaller ones.
+    # Each Gaussian of the object that pictures show is split into parts x parts smaller ones.
     parts: int = 2
+    # Parts are so many times as wide as their share of the surface: those of different Gaussians stand
+    # unevenly, and other views would look through the gaps.
+    overlap: float = 1.5
     # Whether the hands leave their field too.
     hands: bool = True
     # Gaussians of the object less opaque than this are pruned.

@@ -146,7 +146,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "shift_sigma": _POSITIVE,
         "anchor_outlier": _POSITIVE,
     },
-    SplitStage: {"parts": Range(1, 10), "least_opacity": _SHARE},
+    SplitStage: {"parts": Range(1, 10), "overlap": Range(1.0, 4.0), "least_opacity": _SHARE},
     RefineStage: {
         "image_size": _PIXELS,
         "error_share": _SHARE,
