@@ -220,7 +220,8 @@ def test_resumed_between_two_times_it_ends_the_same(
     torch.manual_seed(1234)
     scene, report = fit(tiny, both_hands, config, checkpoints=tmp_path, resume=True)
     assert_same(scene, expected)
-    assert report.facts == facts
+    # What was left out is told with its seconds, which differ.
+    assert {**report.facts, "left out": ""} == {**facts, "left out": ""}
 
 
 def test_after_what_is_not_finite_it_goes_back_to_as_many_as_there_were(
