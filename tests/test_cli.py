@@ -16,7 +16,7 @@ from fake_runs import idle_switch
 import bigs
 from bigs.checks import InputError
 from bigs.commands.run.reconstruct import Outcome
-from bigs.train.fit import FitReport
+from bigs.train.fit_report import FitReport
 from bigs.train.plan.config import RunConfig
 from bigs.train.plan.presets import PRESETS
 

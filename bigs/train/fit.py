@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from bigs.models.scene import Scene
 from bigs.motion.tracker import TrackedMotion
 from bigs.threads import beside
 from bigs.train.digest import run_digest
+from bigs.train.fit_report import FROZEN, OUTSIDE, SETTLED, FitReport
 from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
 from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
@@ -55,25 +56,6 @@ from bigs.train.unseen.visibility import shown
 from bigs.types import Side
 
 
-@dataclass
-class FitReport:
-    """What happened, for logs and tables."""
-
-    seconds: dict[str, float] = field(default_factory=dict)  # per stage; they add up to the whole
-    skipped: list[str] = field(default_factory=list)  # what was not done, and why
-    retreats: list[str] = field(default_factory=list)  # what was not finite, and how the run went on
-    facts: dict[str, str] = field(default_factory=dict)  # what was found out about the clip
-    # Seconds that were not spent on what the clip or a stage does not need, by what that is.
-    spared: dict[str, float] = field(default_factory=dict)
-    completed: bool = False  # whether symmetry has completed the object
-    # Seconds of the interrupted runs that this one continues; `seconds` includes them.
-    before: float = 0.0
-
-    def spare(self, what: str, seconds: float) -> None:
-        """Count seconds that were not spent on something."""
-        self.spared[what] = self.spared.get(what, 0.0) + seconds
-
-
 class Waypoint(NamedTuple):
     """How far a run has come."""
 
@@ -83,11 +65,6 @@ class Waypoint(NamedTuple):
 
 # A Gaussian less free than this stays whole: its parts would hardly learn to close the gaps between them.
 _LEARNS = 0.5
-
-# What is spared, in the words of the report.
-_FROZEN = "fields that a stage does not train, in all of its steps but one"
-_SETTLED = "steps of stages whose loss had settled"
-_OUTSIDE = "of every picture, where hands and object never are"
 
 # Receives plain dicts: {"event": "stage" | "step" | "note", ...}
 Listener = Callable[[dict[str, Any]], None]
@@ -245,7 +222,7 @@ def fit(
             if last.step < stage.steps:
                 left = stage.steps - last.step
                 saved = watch.read()[stage.name] / last.step * left
-                report.spare(_SETTLED, saved)
+                report.spare(SETTLED, saved)
                 report.skipped.append(
                     f"{stage.name}: {left} of {stage.steps} steps, the loss had settled ({saved:.1f} s saved)"
                 )
@@ -256,14 +233,9 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
-    outside = 1.0 - targets.cropped()
-    left_out = [
-        f"{outside:.0%} {what} ({seconds:.2g} s)" if what == _OUTSIDE else f"{what} ({seconds:.2g} s)"
-        for what, seconds in report.spared.items()
-        if (outside if what == _OUTSIDE else seconds) > 0.0
-    ]
+    left_out = report.left_out(1.0 - targets.cropped())
     if left_out:
-        report.facts["left out"] = ", ".join(left_out)
+        report.facts["left out"] = left_out
     report.facts |= finish_mesh(scene, start, sources, config, report.completed)
     report.seconds = watch.read()
     return scene, report
@@ -343,8 +315,8 @@ def _optimise(
 ) -> StageState:
     def after_step(progress: StageProgress, state: StageState) -> None:
         told = progress._asdict()
-        report.spare(_FROZEN, told.pop("fields_spared"))
-        report.spare(_OUTSIDE, told.pop("pixels_spared"))
+        report.spare(FROZEN, told.pop("fields_spared"))
+        report.spare(OUTSIDE, told.pop("pixels_spared"))
         listen({"event": "step", "stage": stage.name, **told, "index": index})
         if progress.step % config.checkpoint_every == 0 and progress.step < stage.steps:
             keep(index, state)

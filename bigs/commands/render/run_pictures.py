@@ -18,7 +18,7 @@ from bigs.geometry.spread import spread
 from bigs.metrics.picture import ALL_METRICS
 from bigs.models.playback import Playback
 from bigs.threads import beside
-from bigs.train.fit import FitReport
+from bigs.train.fit_report import FitReport
 from bigs.viewer.coverage import coverage_map
 from bigs.viewer.preview import contact_sheet, overlay, save_picture, to_bytes, write_video
 from bigs.viewer.report import write_report

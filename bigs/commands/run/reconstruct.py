@@ -37,7 +37,8 @@ from bigs.metrics.report import check_comparable, comparison_table, evaluate, pe
 from bigs.models.playback import record
 from bigs.threads import beside
 from bigs.train.check_plan import check_plan
-from bigs.train.fit import FitReport, Observer, fit
+from bigs.train.fit import Observer, fit
+from bigs.train.fit_report import FitReport
 from bigs.train.loop.checkpoint import FILE_NAME
 from bigs.train.loop.stopwatch import Stopwatch
 from bigs.train.plan.config import RunConfig

@@ -20,7 +20,8 @@ from bigs.guidance.pixel_file import save_pixel_net
 from bigs.hand import HandModel
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.scene import Scene
-from bigs.train.fit import FitReport, fit
+from bigs.train.fit import fit
+from bigs.train.fit_report import FitReport
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.step import Selection, Step
 from bigs.train.loop.target_source import TargetSource

@@ -16,7 +16,8 @@ from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import ShapeScore
 from bigs.models.scene import Scene
-from bigs.train.fit import FitReport, fit
+from bigs.train.fit import fit
+from bigs.train.fit_report import FitReport
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import CompletionStage, PriorConfig, RunConfig, SplitStage
