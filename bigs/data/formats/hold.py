@@ -139,7 +139,7 @@ def write_hold(
     for sub, frames in (("image", images), ("mask", masks)):
         (build / sub).mkdir(parents=True, exist_ok=True)
         for t, frame in enumerate(frames):
-            # The default level takes twice as long for files of the same size.
+            # The default level takes three times as long for files of the same size.
             Image.fromarray(frame).save(build / sub / f"{t:04d}.png", compress_level=4)
     (build / "corres.txt").write_text("".join(f"{line}\n" for line in frame_names))
 
