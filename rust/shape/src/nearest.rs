@@ -5,48 +5,72 @@ use crate::Vec3;
 /// A part with at most this many points is looked through.
 const LEAF: usize = 8;
 
-/// Points in a k-d tree.
+/// Points in a tree of boxes, each of which is halved across its longest side.
 #[derive(Clone, Debug)]
 pub(crate) struct Nearest {
     /// In the tree's order, with their indices.
     points: Vec<(Vec3, usize)>,
-    /// Of each inner node, whose children are 2 i + 1 and 2 i + 2: the axis that it splits, and where.
-    splits: Vec<(usize, f64)>,
+    /// The smallest box around the points of each node, whose children are 2 i + 1 and 2 i + 2.
+    boxes: Vec<Box3>,
+}
+
+/// Part of the points, and the node that it belongs to.
+#[derive(Clone, Copy)]
+struct Part {
+    node: usize,
+    begin: usize,
+    end: usize,
+}
+
+impl Part {
+    fn halves(self) -> [Self; 2] {
+        let half = self.begin + (self.end - self.begin) / 2;
+        let child = |i, begin, end| Self {
+            node: 2 * self.node + i,
+            begin,
+            end,
+        };
+        [child(1, self.begin, half), child(2, half, self.end)]
+    }
+
+    fn is_leaf(self) -> bool {
+        self.end - self.begin <= LEAF
+    }
 }
 
 impl Nearest {
     pub(crate) fn new(points: &[Vec3]) -> Self {
         let mut tree = Self {
             points: points.iter().copied().zip(0..).collect(),
-            splits: Vec::new(),
+            boxes: Vec::new(),
         };
-        tree.split(0, 0, points.len());
+        tree.build(tree.whole());
         tree
     }
 
-    fn split(&mut self, node: usize, begin: usize, end: usize) {
-        if end - begin <= LEAF {
+    fn whole(&self) -> Part {
+        Part {
+            node: 0,
+            begin: 0,
+            end: self.points.len(),
+        }
+    }
+
+    fn build(&mut self, part: Part) {
+        let points = &mut self.points[part.begin..part.end];
+        let around = Box3::around(points.iter().map(|(point, _)| point));
+        if self.boxes.len() <= part.node {
+            self.boxes.resize(part.node + 1, Box3::NOTHING);
+        }
+        self.boxes[part.node] = around;
+        if part.is_leaf() {
             return;
         }
-        let part = &mut self.points[begin..end];
-        let (mut lower, mut upper) = (part[0].0, part[0].0);
-        for (point, _) in part.iter() {
-            for i in 0..3 {
-                lower[i] = lower[i].min(point[i]);
-                upper[i] = upper[i].max(point[i]);
-            }
+        let axis = around.longest_side();
+        points.select_nth_unstable_by(points.len() / 2, |a, b| a.0[axis].total_cmp(&b.0[axis]));
+        for half in part.halves() {
+            self.build(half);
         }
-        let extent = |i: usize| upper[i] - lower[i];
-        let axis = (1..3).fold(0, |best, i| if extent(i) > extent(best) { i } else { best });
-        let half = part.len() / 2;
-        part.select_nth_unstable_by(half, |a, b| a.0[axis].total_cmp(&b.0[axis]));
-        let place = part[half].0[axis];
-        if self.splits.len() <= node {
-            self.splits.resize(node + 1, (0, 0.0));
-        }
-        self.splits[node] = (axis, place);
-        self.split(2 * node + 1, begin, begin + half);
-        self.split(2 * node + 2, begin + half, end);
     }
 
     /// Index of the point that is nearest to a place, if it is nearer than `reach`.
@@ -56,20 +80,13 @@ impl Nearest {
 
     /// Squared distance and index of the nearest point, or `best` if none is nearer than that.
     pub(crate) fn nearer(&self, place: Vec3, mut best: (f64, Option<usize>)) -> (f64, Option<usize>) {
-        self.look((0, 0, self.points.len()), place, [0.0; 3], &mut best);
+        self.look(self.whole(), place, &mut best);
         best
     }
 
-    /// `beyond` is how far the place is out of the node's part of space along each axis, squared.
-    fn look(
-        &self,
-        (node, begin, end): (usize, usize, usize),
-        place: Vec3,
-        beyond: Vec3,
-        best: &mut (f64, Option<usize>),
-    ) {
-        if end - begin <= LEAF {
-            for (point, index) in &self.points[begin..end] {
+    fn look(&self, part: Part, place: Vec3, best: &mut (f64, Option<usize>)) {
+        if part.is_leaf() {
+            for (point, index) in &self.points[part.begin..part.end] {
                 let squared = squared_distance(*point, place);
                 if squared < best.0 {
                     *best = (squared, Some(*index));
@@ -77,21 +94,49 @@ impl Nearest {
             }
             return;
         }
-        let (axis, split) = self.splits[node];
-        let away = place[axis] - split;
-        let half = begin + (end - begin) / 2;
-        let (lower, upper) = ((2 * node + 1, begin, half), (2 * node + 2, half, end));
-        let (first, second) = if away < 0.0 {
-            (lower, upper)
-        } else {
-            (upper, lower)
-        };
-        self.look(first, place, beyond, best);
-        let mut beyond = beyond;
-        beyond[axis] = away * away;
-        if beyond[0] + beyond[1] + beyond[2] < best.0 {
-            self.look(second, place, beyond, best);
+        let mut halves = part
+            .halves()
+            .map(|half| (self.boxes[half.node].squared_distance(place), half));
+        if halves[1].0 < halves[0].0 {
+            halves.swap(0, 1);
         }
+        for (squared, half) in halves {
+            if squared < best.0 {
+                self.look(half, place, best);
+            }
+        }
+    }
+}
+
+/// A box along the axes.
+#[derive(Clone, Copy, Debug)]
+struct Box3 {
+    lower: Vec3,
+    upper: Vec3,
+}
+
+impl Box3 {
+    const NOTHING: Self = Self {
+        lower: [f64::INFINITY; 3],
+        upper: [f64::NEG_INFINITY; 3],
+    };
+
+    fn around<'a>(points: impl Iterator<Item = &'a Vec3>) -> Self {
+        points.fold(Self::NOTHING, |found, point| Self {
+            lower: [0, 1, 2].map(|i| found.lower[i].min(point[i])),
+            upper: [0, 1, 2].map(|i| found.upper[i].max(point[i])),
+        })
+    }
+
+    fn longest_side(&self) -> usize {
+        let side = |i: usize| self.upper[i] - self.lower[i];
+        (1..3).fold(0, |best, i| if side(i) > side(best) { i } else { best })
+    }
+
+    /// From a place to the nearest of the box; rounded as those of its points are, so never above them.
+    fn squared_distance(&self, place: Vec3) -> f64 {
+        let away = [0, 1, 2].map(|i| (self.lower[i] - place[i]).max(place[i] - self.upper[i]).max(0.0));
+        away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
     }
 }
 
