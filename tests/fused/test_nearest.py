@@ -9,11 +9,13 @@ from scipy.spatial import cKDTree
 from bigs.fused.nearest import NearestPoints
 
 
+@pytest.mark.parametrize("away", [0.0, 30.0])
 @pytest.mark.parametrize("count", [1, 2, 30, 3000])
-def test_as_scipy_finds_them(count: int) -> None:
+def test_as_scipy_finds_them(count: int, away: float) -> None:
+    """Also where all places are far from all points, and one box of them is as near as another."""
     rng = np.random.default_rng(count)
     points = rng.normal(size=(count, 3)) * [1.0, 0.3, 0.0]
-    places = np.concatenate([rng.normal(size=(500, 3)), points[:50], [[90.0, 0.0, -1.0]]])
+    places = np.concatenate([rng.normal(size=(500, 3)), points[:50], [[90.0, 0.0, -1.0]]]) + away
     distances, indices = NearestPoints(points).of(places)
     np.testing.assert_array_equal(distances, cKDTree(points).query(places)[0])
     np.testing.assert_allclose(np.linalg.norm(points[indices] - places, axis=1), distances, rtol=1e-14)
