@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from fake_runs import idle_switch
 
 import bigs
 from bigs.checks import InputError
+from bigs.cli.__main__ import run
 from bigs.commands.run.reconstruct import Outcome
 from bigs.train.fit_report import FitReport
 from bigs.train.plan.config import RunConfig
@@ -243,3 +245,19 @@ def test_help_and_refusals_do_not_wait_for_torch() -> None:
     script = "import sys, bigs.cli.app; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_the_process_ends_without_a_search_for_cycles(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    def leave() -> None:
+        sys.exit(code)
+
+    monkeypatch.setattr("bigs.cli.__main__.main", leave)
+    before = gc.get_freeze_count()
+    try:
+        with pytest.raises(SystemExit) as left:
+            run()
+        assert left.value.code == code
+        assert gc.get_freeze_count() > before + 1000
+    finally:
+        gc.unfreeze()

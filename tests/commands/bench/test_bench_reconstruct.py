@@ -19,6 +19,7 @@ from bigs.commands.bench.reconstruct import RunPlan, bench_reconstruct, variants
 from bigs.commands.folder.contents import CONFIG, SCENE
 from bigs.data.base import Clip
 from bigs.hand import HandModel
+from bigs.metrics import align
 from bigs.train.plan.config import OptimizeStage
 from bigs.train.plan.config_file import load_config
 from bigs.train.plan.length import planned_steps
@@ -81,8 +82,11 @@ def test_a_probe(tiny: Clip, both_hands: dict[Side, HandModel]) -> None:
 
 
 @pytest.mark.slow
-def test_a_curve(finished_run: Run, tiny_clip: Path, tmp_path: Path) -> None:
+def test_a_curve(finished_run: Run, tiny_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores along the run, whose result is that of a run that nothing watches."""
+    # How well shapes are aligned is not asked here, and each point of the curve asks for one.
+    monkeypatch.setattr(align, "_COARSE_ITERATIONS", 2)
+    monkeypatch.setattr(align, "_FINE_ITERATIONS", 2)
     plan = RunPlan((tiny_clip,), ("smoke",), curve_every=0.3, growth_steps=0)
     assert bench_reconstruct(plan, tmp_path, picture=False).failed == []
     (run,) = json.loads((tmp_path / "reconstruct.json").read_text())["runs"]
