@@ -97,12 +97,12 @@ def _parameters(owner: nn.Module | nn.Parameter) -> Iterable[nn.Parameter]:
 def make_optimizer(
     scene: Scene,
     lrs: Mapping[str, float],
+    betas: tuple[float, float],
     frame_moments: bool = False,
-    betas: tuple[float, float] = (0.9, 0.99),
 ) -> FrameAdam:
     """Adam over the listed groups; everything else is set not to require a gradient.
 
-    `frame_moments` and `betas` are as in `OptimizeStage`.
+    `betas` and `frame_moments` are as in `OptimizeStage`.
     """
     scene.requires_grad_(False)
     groups = []

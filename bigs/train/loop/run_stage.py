@@ -125,7 +125,7 @@ def run_stage(
         raise InputError(f"stage {stage.name}: expected a prior's model for the term 'sds', found none")
     if resume is None and "scene.ambient" in stage.lrs and scene.lighting is not None:
         measure_occlusion(scene)
-    optimizer = make_optimizer(scene, stage.lrs, stage.frame_moments, stage.adam_betas)
+    optimizer = make_optimizer(scene, stage.lrs, stage.adam_betas, stage.frame_moments)
     state = StageState.begun(0, optimizer)
     densify = None if scene.object_splats is None else stage.densify
     if densify is not None:

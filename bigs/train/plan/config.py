@@ -38,8 +38,9 @@ class OptimizeStage:
     # Learning rates fall to this share, along a cosine or by the same factor in every step.
     final_lr: float = 0.1
     decay: Literal["cosine", "exponential"] = "cosine"
-    # Adam's. The second suits stages of hundreds of steps, where 0.999 would still remember the first.
-    adam_betas: tuple[float, float] = (0.9, 0.99)
+    # Adam's. Where 0.9 and 0.999 are usual, poses overshoot and swing about their place for dozens of steps,
+    # and a stage of hundreds of steps would still remember the first.
+    adam_betas: tuple[float, float] = (0.8, 0.99)
     # Stop if the mean loss of `stop_patience` steps differs by less than `stop_gain` (relative) from that of
     # as many before; 0: never. For stages that look at the whole clip in every step: others waver.
     stop_patience: int = 0

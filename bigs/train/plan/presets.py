@@ -44,7 +44,7 @@ _SETTLED = 10
 _HANDS_COARSE = OptimizeStage(
     name="hands-coarse",
     step="single-subject",
-    steps=60,
+    steps=45,
     lrs={
         "hand.orient": 0.02,
         "hand.pose": 0.02,
@@ -61,7 +61,7 @@ _HANDS_COARSE = OptimizeStage(
 _HANDS_FINE = OptimizeStage(
     name="hands-fine",
     step="single-subject",
-    steps=100,
+    steps=75,
     lrs={
         "hand.orient": 0.006,
         "hand.pose": 0.008,
@@ -89,7 +89,7 @@ _GRASPED_RATES = {
 _GRASPED = OptimizeStage(
     name="grasped",
     step="single-subject",
-    steps=50,
+    steps=38,
     lrs=_GRASPED_RATES,
     weights={"silhouette": 1.0, **_GRASP_PRIORS},
     image_size=160,
@@ -99,7 +99,7 @@ _GRASPED = OptimizeStage(
 _CONTACT = OptimizeStage(
     name="contact",
     step="interacting-subjects",
-    steps=50,
+    steps=38,
     lrs=_GRASPED_RATES,
     weights={"silhouette": 1.0, **_GRASP_PRIORS, **_TOUCH},
     image_size=160,
@@ -137,7 +137,7 @@ _MOVES = MoveStage(
 _REGRASP = OptimizeStage(
     name="regrasp",
     step="single-subject",
-    steps=90,
+    steps=70,
     lrs={"hand.orient": 0.015, "hand.pose": 0.03, "hand.ray": 0.003, "hand.depth": 0.008},
     weights={"silhouette": 1.0, "image": 0.2, **_POSE_PRIORS, "acceleration": 0.002, "depth_prior": 1.0},
     image_size=160,
@@ -277,17 +277,17 @@ DEMO = replace(
     FAST,
     stages=(
         _HANDS_COARSE,
-        replace(_HANDS_FINE, steps=60),
+        replace(_HANDS_FINE, steps=45),
         ScaleSearchStage(),
         GraspStage(),
-        replace(_GRASPED, steps=40),
+        replace(_GRASPED, steps=30),
         _APPEARANCE,
         GraspStage(name="grasps-2"),
-        replace(_CONTACT, steps=40),
+        replace(_CONTACT, steps=30),
         _MOVES,
-        replace(_REGRASP, steps=60),
+        replace(_REGRASP, steps=45),
         SplitStage(),
-        replace(_JOINT, steps=110),
+        replace(_JOINT, steps=90),
         CompletionStage(),
         GuidanceStage(steps=150),
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -254,6 +255,15 @@ def test_frozen_fields_are_evaluated_once(
 
 
 # --- what a hook sees ---
+
+
+def test_adam_forgets_as_the_stage_says(scene: Scene, evidence: Evidence) -> None:
+    ends = []
+    for betas in ((0.8, 0.99), (0.5, 0.99), (0.8, 0.9)):
+        start = copy.deepcopy(scene)
+        run_stage(start, replace(ALONE, steps=3, adam_betas=betas), evidence, 0)
+        ends.append(torch.cat([values.ravel() for values in start.parameters()]))
+    assert not torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
 def test_the_hook_sees_every_step(scene: Scene, evidence: Evidence) -> None:

@@ -22,6 +22,8 @@ from bigs.train.plan.presets import SMOKE
 from bigs.train.start.build import build_scene
 from bigs.types import Side
 
+BETAS = (0.9, 0.99)
+
 
 def assert_partition(scene: Scene) -> None:
     names = {id(p): name for name, p in scene.named_parameters()}
@@ -61,12 +63,12 @@ def test_field_groups_are_what_a_canonical_subject_depends_on(both_hands: dict[S
 
 def test_an_unknown_group_is_named(both_hands: dict[Side, HandModel]) -> None:
     with pytest.raises(InputError, match=r"expected one of .* groups, found 'hand\.rays'"):
-        make_optimizer(cube_scene(both_hands), {"hand.rays": 0.1})
+        make_optimizer(cube_scene(both_hands), {"hand.rays": 0.1}, BETAS)
 
 
 def test_only_listed_groups_require_gradients(both_hands: dict[Side, HandModel]) -> None:
     scene = cube_scene(both_hands)
-    make_optimizer(scene, {"hand.ray": 0.1, "object.scale": 0.2, "scene.light": 0.3})
+    make_optimizer(scene, {"hand.ray": 0.1, "object.scale": 0.2, "scene.light": 0.3}, BETAS)
     trainable = {name for name, p in scene.named_parameters() if p.requires_grad}
     assert trainable == {
         "hand_poses.right.position.ray",
@@ -77,7 +79,7 @@ def test_only_listed_groups_require_gradients(both_hands: dict[Side, HandModel])
 
 
 def test_rates_fall_along_a_cosine(both_hands: dict[Side, HandModel]) -> None:
-    optimizer = make_optimizer(cube_scene(both_hands), {"hand.ray": 0.5, "hand.depth": 2.0})
+    optimizer = make_optimizer(cube_scene(both_hands), {"hand.ray": 0.5, "hand.depth": 2.0}, BETAS)
     for progress, share in ((0.0, 1.0), (0.5, 0.55), (0.25, 0.1 + 0.45 * (1 + math.sqrt(0.5))), (1.0, 0.1)):
         set_rates(optimizer, progress, 0.1)
         rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
@@ -96,7 +98,7 @@ def test_rates_fall_by_the_same_factor(both_hands: dict[Side, HandModel]) -> Non
 def test_a_frame_outside_the_step_keeps_turns_and_moments(both_hands: dict[Side, HandModel]) -> None:
     scene = cube_scene(both_hands)
     optimizer = make_optimizer(
-        scene, {"hand.pose": 0.1, "hand.depth": 0.1, "object.orient": 0.1}, frame_moments=True
+        scene, {"hand.pose": 0.1, "hand.depth": 0.1, "object.orient": 0.1}, BETAS, frame_moments=True
     )
     turns, depths = scene.hand_poses["right"].pose, scene.hand_poses["right"].position.log_depth
     others = list(range(1, scene.n_frames))
@@ -124,9 +126,9 @@ def test_a_step_on_all_frames_is_plain_adam(both_hands: dict[Side, HandModel]) -
     poses = []
     for plain in (True, False):
         scene = cube_scene(both_hands)
-        optimizer = make_optimizer(scene, {"hand.pose": 0.1}, frame_moments=True)
+        optimizer = make_optimizer(scene, {"hand.pose": 0.1}, BETAS, frame_moments=True)
         pose = scene.hand_poses["right"].pose
-        torchs = torch.optim.Adam(optimizer.parameters(), lr=0.1, betas=(0.9, 0.99), eps=1e-15, fused=True)
+        torchs = torch.optim.Adam(optimizer.parameters(), lr=0.1, betas=BETAS, eps=1e-15, fused=True)
         for _ in range(3):
             optimizer.zero_grad()
             (pose - 1.0).square().sum().backward()
