@@ -281,7 +281,7 @@ DEMO = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=30),
-        _APPEARANCE,
+        replace(_APPEARANCE, steps=25),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=30),
         _MOVES,
