@@ -9,7 +9,8 @@ from importlib.metadata import entry_points, version
 from pathlib import Path
 
 import bigs
-from bigs.cli import main, runs, terminal
+from bigs.cli import runs, terminal
+from bigs.cli.__main__ import run
 from bigs.commands.export.formats import FORMATS
 from bigs.commands.render import views
 from bigs.train.plan.presets import PRESETS
@@ -35,9 +36,9 @@ def test_one_version() -> None:
     assert bigs.__version__ == version("bigs") == cargo["workspace"]["package"]["version"]
 
 
-def test_the_console_script_is_main() -> None:
+def test_the_console_script_is_the_process() -> None:
     (script,) = entry_points(group="console_scripts", name="bigs")
-    assert script.load() is main
+    assert script.load() is run
 
 
 def test_the_python_version_is_said_once() -> None:
