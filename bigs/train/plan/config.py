@@ -38,8 +38,8 @@ class OptimizeStage:
     # Learning rates fall to this share, along a cosine or by the same factor in every step.
     final_lr: float = 0.1
     decay: Literal["cosine", "exponential"] = "cosine"
-    # Adam's. Where 0.9 and 0.999 are usual, poses overshoot and swing about their place for dozens of steps,
-    # and a stage of hundreds of steps would still remember the first.
+    # Adam's two decays. With the usual 0.9 poses overshoot and swing about their place for dozens of steps;
+    # with the usual 0.999 a stage of hundreds of steps still remembers its first.
     adam_betas: tuple[float, float] = (0.8, 0.99)
     # Stop if the mean loss of `stop_patience` steps differs by less than `stop_gain` (relative) from that of
     # as many before; 0: never. For stages that look at the whole clip in every step: others waver.

@@ -254,9 +254,6 @@ def test_frozen_fields_are_evaluated_once(
     assert (spared[1] > 0.0) == (1 in expected.values())
 
 
-# --- what a hook sees ---
-
-
 def test_adam_forgets_as_the_stage_says(scene: Scene, evidence: Evidence) -> None:
     ends = []
     for betas in ((0.8, 0.99), (0.5, 0.99), (0.8, 0.9)):
@@ -264,6 +261,9 @@ def test_adam_forgets_as_the_stage_says(scene: Scene, evidence: Evidence) -> Non
         run_stage(start, replace(ALONE, steps=3, adam_betas=betas), evidence, 0)
         ends.append(torch.cat([values.ravel() for values in start.parameters()]))
     assert not torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
+
+
+# --- what a hook sees ---
 
 
 def test_the_hook_sees_every_step(scene: Scene, evidence: Evidence) -> None:
