@@ -293,10 +293,10 @@ DEMO = replace(
     ),
 )
 
-# Finer images and fields, and more steps where colours decide. Silhouettes alone get their steps of `fast`:
-# more of them bend hidden fingers and change the hands' size to fit what masks do not tell. In the many steps
-# of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said: colours,
-# which light and shade never explain altogether, would in time turn it by some tenths of a degree.
+# Finer images and fields, and more steps where colours decide. Silhouettes alone get a third more steps than
+# in `fast`: many more bend hidden fingers and change the hands' size to fit what masks do not tell. In the
+# many steps of `detail` fingers move slowly for the same reason, and the object keeps to what tracks said:
+# colours, which light and shade never explain altogether, would in time turn it by some tenths of a degree.
 _FIRM_OBJECT = {"object_prior": 50.0}
 # So many steps would also turn knuckles that the camera hardly sees into sparks.
 _CALM_HANDS = {"hand_color_prior": 0.015, "hand_thickness": 0.15}
@@ -306,17 +306,17 @@ FULL = replace(
     object=replace(FAST.object, n_gaussians=12_000, triplane=TriplaneConfig(features=24, resolution=192)),
     stages=(
         ObjectMotionStage(),
-        _HANDS_COARSE,
-        _HANDS_FINE,
+        replace(_HANDS_COARSE, steps=60),
+        replace(_HANDS_FINE, steps=100),
         ScaleSearchStage(),
         GraspStage(),
-        _GRASPED,
+        replace(_GRASPED, steps=50),
         replace(_APPEARANCE, steps=80),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
-        _CONTACT,
+        replace(_CONTACT, steps=50),
         _MOVES,
-        _REGRASP,
+        replace(_REGRASP, steps=90),
         _FREED,
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
         RefineStage(image_size=640),
