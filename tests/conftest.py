@@ -12,6 +12,7 @@ import torch
 from command_line import Answer, Run, run_bigs
 from fake_runs import FakeRuns
 from family import Family
+from forked import Nursery
 from made_once import MadeOnce
 
 from bigs.cli import main
@@ -79,6 +80,13 @@ def finished_run(made_once: MadeOnce, tiny_clip: Path) -> Run:
     command = ["reconstruct", str(tiny_clip), "--preset", "smoke", "--gt", str(tiny_clip / "gt.npz")]
     folder, answer = made_once("finished", lambda folder: run_bigs(*command, "--out", folder / "run"))
     return Run(folder / "run", command, Answer(*answer))
+
+
+@pytest.fixture(scope="session")
+def nursery() -> Iterator[Nursery]:
+    """Starts `bigs` in processes that need not import anything."""
+    with Nursery() as nursery:
+        yield nursery
 
 
 @pytest.fixture

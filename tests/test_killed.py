@@ -7,7 +7,6 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -42,12 +41,6 @@ QUICK = [
 # The object's Gaussians become more after the first step of a stage and, after a checkpoint, the second.
 DENSIFY = "{first: 0.3, last: 0.9, every: 0.3, threshold: 1.0e-9, floor: 1, ceiling: 900}"
 QUICK.append(f"--set=stages.appearance.densify={DENSIFY}")
-
-
-@pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    with Nursery() as nursery:
-        yield nursery
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import copy
 import json
 import os
 import signal
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import Answer, Run, assert_refused, run_bigs
-from family import Family
+from command_line import Answer, Run, assert_refused
+from forked import KILLED, Nursery
 from safetensors.numpy import load_file
 
 from bigs.checks import InputError
@@ -30,28 +29,29 @@ from bigs.train.resolve import resolve
 pytestmark = pytest.mark.slow
 
 
-def wait_for(log: Path, text: str, process: subprocess.Popen[bytes]) -> None:
+def wait_for(log: Path, text: str, lives: Callable[[], bool]) -> None:
     while not (log.exists() and text in log.read_text()):
-        assert process.poll() is None, "ended before it could be killed"
+        assert lives(), "ended before it could be killed"
         time.sleep(0.005)
 
 
-def test_killed_twice_and_resumed_it_ends_the_same(family: Family, finished_run: Run, tmp_path: Path) -> None:
+def test_killed_twice_and_resumed_it_ends_the_same(
+    nursery: Nursery, finished_run: Run, tmp_path: Path
+) -> None:
     """Within a stage between two checkpoints, and again in a later stage; to the same bytes."""
-    out = tmp_path / "run"
+    out, said = tmp_path / "run", tmp_path / "said"
     # How often checkpoints are kept does not change the result.
-    command = [*finished_run.command, "--set", "checkpoint_every=4", "--out", str(out)]
+    command = [*finished_run.command, "--set", "checkpoint_every=4", "--out", str(out), "--resume"]
     for stage, step in (("hands-coarse", 10), ("appearance", 2)):
-        process = family.start_bigs(
-            *command, "--resume", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        wait_for(out / "log.jsonl", f'"step", "stage": "{stage}", "step": {step},', process)
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
+        pid = nursery.start(*command, output=said)
+        place = f'"step", "stage": "{stage}", "step": {step},'
+        wait_for(out / "log.jsonl", place, lambda pid=pid: nursery.lives(pid))
+        os.kill(pid, signal.SIGKILL)
+        assert nursery.ended() == KILLED
         assert not (out / "scene.safetensors").exists()
     # In a process of its own: other tests may have changed this one's number of threads.
-    answer = run_bigs(*command, "--resume")
-    assert answer.code == 0, answer.err
+    nursery.start(*command, output=said)
+    assert nursery.ended() == 0, said.read_text()
     expected, found = (load_file(folder / "scene.safetensors") for folder in (finished_run.folder, out))
     assert expected.keys() == found.keys()
     assert [key for key in expected if not np.array_equal(expected[key], found[key])] == []

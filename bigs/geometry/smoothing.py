@@ -49,22 +49,23 @@ def smooth_rotations(rotations: Tensor, weights: Tensor, sigma: float) -> Tensor
     """The same on SO(3): a local-linear fit in the tangent space at each window's robust mean.
 
     Args:
-        rotations: [T, 3, 3].
+        rotations: [..., T, 3, 3], such as one trajectory for each joint.
         weights: [T] trust in each frame.
         sigma: width of the window in frames; 0 returns `rotations`.
 
     Returns:
-        [T, 3, 3].
+        [..., T, 3, 3].
     """
-    if sigma <= 0 or len(rotations) < 3:
+    frames = rotations.shape[-3]
+    if sigma <= 0 or frames < 3:
         return rotations
-    offsets, near = _window(len(rotations), sigma)
-    windows = rotations[near.index]  # [T, W, 3, 3]
+    offsets, near = _window(frames, sigma)
+    windows = rotations[..., near.index, :, :]  # [..., T, W, 3, 3]
     trust = weights.clone()
     for _ in range(3):
         window_weights = _window_weights(near, trust)
         centre = mean_rotation(windows, window_weights)
-        tangent = matrix_to_axis_angle(centre[:, None].transpose(-1, -2) @ windows)
+        tangent = matrix_to_axis_angle(centre[..., None, :, :].transpose(-1, -2) @ windows)
         fitted = centre @ axis_angle_to_matrix(_local_linear(tangent, offsets, window_weights))
         error = matrix_to_axis_angle(fitted.transpose(-1, -2) @ rotations).norm(dim=-1)
         trust = weights * _tukey(error, weights)
@@ -93,30 +94,30 @@ def _window(frames: int, sigma: float) -> tuple[Tensor, _Near]:
 
 
 def _window_weights(near: _Near, trust: Tensor) -> Tensor:
-    """Weights [T, W] of a window's frames; where none is trusted, their nearness alone."""
-    weights = near.weight * trust[near.index]
-    return torch.where(weights.sum(1, keepdim=True) > 1e-6, weights, near.weight)
+    """Weights [..., T, W] of a window's frames; where none is trusted, their nearness alone."""
+    weights = near.weight * trust[..., near.index]
+    return torch.where(weights.sum(-1, keepdim=True) > 1e-6, weights, near.weight)
 
 
 def _local_linear(values: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
-    """Value at offset 0 of a weighted line through each window: [T, W, D], [W], [T, W] to [T, D]."""
-    weights = weights / weights.sum(1, keepdim=True)
-    mean_x = (weights * offsets).sum(1, keepdim=True)
-    mean_y = (weights[..., None] * values).sum(1)
+    """Value at offset 0 of a weighted line through each window: [..., W, D], [W], [..., W] to [..., D]."""
+    weights = weights / weights.sum(-1, keepdim=True)
+    mean_x = (weights * offsets).sum(-1, keepdim=True)
+    mean_y = (weights[..., None] * values).sum(-2)
     centred = offsets - mean_x
-    variance = (weights * centred**2).sum(1, keepdim=True)
-    slope = (weights[..., None] * centred[..., None] * values).sum(1) / variance.clamp_min(1e-3)
+    variance = (weights * centred**2).sum(-1, keepdim=True)
+    slope = (weights[..., None] * centred[..., None] * values).sum(-2) / variance.clamp_min(1e-3)
     return mean_y - slope * mean_x
 
 
 def _tukey(residuals: Tensor, weights: Tensor) -> Tensor:
-    """Tukey's biweight of residual norms [T], with a cut-off from their own median."""
+    """Tukey's biweight of residual norms [..., T], with a cut-off from their own median."""
     # Interpolated frames fit a line exactly and would pull the median to zero.
-    trusted = residuals[weights > 0.5 * weights.max()]
-    if len(trusted) == 0:
+    trusted = residuals[..., weights > 0.5 * weights.max()]
+    if trusted.shape[-1] == 0:
         return torch.ones_like(residuals)
     # 1.48 median estimates a standard deviation; 4.685 of those is the usual cut-off. Norms of 3-vectors
     # have a larger median than one coordinate's absolute value, so this errs on the side of keeping frames.
     # A still clip has a median of zero too: nothing within _EXACT is an outlier.
-    cut = 4.685 * 1.48 * trusted.median().clamp_min(_EXACT)
+    cut = 4.685 * 1.48 * trusted.median(-1, keepdim=True).values.clamp_min(_EXACT)
     return (1.0 - (residuals / cut).clamp(max=1.0) ** 2) ** 2

@@ -13,16 +13,17 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage
 
 from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.touching import masks_touch
-from bigs.geometry.surface import DistanceGrid, inlier_points
+from bigs.geometry.arrays import float32
+from bigs.geometry.distance import DistanceField
+from bigs.geometry.surface import inlier_points
 from bigs.hand import HandModel
 from bigs.preprocess.artefacts import USUAL_DEPTH_SIGMA, Alignment, ObjectSfm
 from bigs.preprocess.hands.tracks import posed_track
-from bigs.preprocess.object.rough_surface import RoughSurface, SurfaceConfig, rough_surface, sights
+from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, sights
 from bigs.types import Side
 
 
@@ -111,6 +112,7 @@ def align(
     points = points[inlier_points(points)]
     seen = sights(points, sfm.rotations, guess * sfm.transl, sfm.confidence, masks, K, config.surface)
     surface = rough_surface(points, seen, config.surface)
+    outer, solid = DistanceField(surface.outer), DistanceField(surface.solid)
     factors = np.exp(np.linspace(-config.span, config.span, config.sizes))
     frames = sum(int(t.sum()) for t in touching.values())
     if frames == 0:
@@ -135,7 +137,7 @@ def align(
                 rays[side],
                 touching[side],
                 (sfm.rotations, guess * sfm.transl),
-                surface,
+                (outer, solid),
                 factor,
                 config,
             )
@@ -190,7 +192,7 @@ def contact_costs(
     rays: np.ndarray,
     touching: np.ndarray,
     poses: tuple[np.ndarray, np.ndarray],
-    surface: RoughSurface,
+    surfaces: tuple[DistanceField, DistanceField],
     factor: float,
     config: AlignConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +203,7 @@ def contact_costs(
         rays: [T, 3] unit.
         touching: [T] bool; in the other frames only shifts cost.
         poses: rotations [T, 3, 3] and translations [T, 3] of the object at factor 1.
-        surface: the object's at factor 1, in its own frame.
+        surfaces: the object's at factor 1, in its own frame: what a hand touches, and what it is never in.
         factor: on size and depth together.
         config: see there.
 
@@ -220,24 +222,12 @@ def contact_costs(
     for t in np.flatnonzero(touching):
         at = (verts[t] @ rotations[t]) / factor - transl[t] @ rotations[t]
         along = rays[t] @ rotations[t] / factor
-        places = at + shifts[t][:, None, None] * along
-        outside, inside = (
-            factor * sample_grid(grid, places.reshape(-1, 3)).reshape(places.shape[:2])
-            for grid in (surface.outer, surface.solid)
-        )
+        places = float32(at + shifts[t][:, None, None] * along)
+        outside, inside = (factor * surface(places).numpy() for surface in surfaces)
         near = np.partition(outside, count - 1, axis=1)[:, :count].clip(0.0)
         deep = (-inside - config.depth).clip(0.0, 0.02) / config.saturation
         costs[t] += (near / (near + config.saturation)).mean(1) + config.penetration * deep.mean(1)
     return costs, shifts
-
-
-def sample_grid(grid: DistanceGrid, points: np.ndarray) -> np.ndarray:
-    """Distances [N] of points [N, 3]; beyond the grid, the distance to its box is added."""
-    upper = grid.origin + grid.spacing * (np.array(grid.values.shape) - 1)
-    inside = np.clip(points, grid.origin, upper)
-    index = (inside - grid.origin) / grid.spacing
-    values = scipy.ndimage.map_coordinates(grid.values, index.T, order=1, prefilter=False)
-    return values + np.linalg.norm(points - inside, axis=1)
 
 
 def cheapest_path(costs: np.ndarray, config: AlignConfig) -> tuple[float, np.ndarray]:

@@ -71,6 +71,16 @@ def test_a_flipped_rotation_leaves_no_trace() -> None:
     torch.testing.assert_close(torch.linalg.det(smooth), torch.ones(T).double())
 
 
+def test_trajectories_side_by_side_are_smoothed_as_each_by_itself() -> None:
+    """An outlier of one takes no weight from the others."""
+    several = torch.stack([turning() @ axis_angle_to_matrix(noise(0.02, seed)) for seed in range(6)])
+    several[2, 20] = several[2, 20] @ axis_angle_to_matrix(torch.tensor([2.5, 0.0, 0.0]).double())
+    weights = torch.linspace(0.2, 1.0, T).double()
+    together = smooth_rotations(several.reshape(2, 3, T, 3, 3), weights, 2.0).reshape(6, T, 3, 3)
+    for one, found in zip(several, together, strict=True):
+        torch.testing.assert_close(found, smooth_rotations(one, weights, 2.0), atol=1e-12, rtol=0)
+
+
 def test_frames_without_weight_are_filled_from_their_neighbours() -> None:
     values, weights = line() + noise(1e-4), torch.ones(T).double()
     values[10:13] = 7.0

@@ -14,9 +14,8 @@ from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.formats.hold import load_hold
 from bigs.data.synthetic import make_clip
-from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models
-from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices, sample_grid
+from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices
 from bigs.preprocess.artefacts import ObjectSfm
 from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, sights
 from bigs.types import Side
@@ -181,11 +180,3 @@ def test_the_cheapest_path_is_the_cheapest_of_all() -> None:
     best = min(np.ndindex(4, 4, 4, 4), key=total)
     cost, path = cheapest_path(costs, config)
     assert tuple(path) == best and cost == pytest.approx(total(best))
-
-
-def test_a_grid_is_sampled_inside_and_beyond() -> None:
-    axis = np.linspace(-1.0, 1.0, 21)
-    values = np.broadcast_to(axis[:, None, None], (21, 21, 21)).copy()
-    grid = DistanceGrid(values, np.full(3, -1.0), 0.1)
-    points = np.array([[0.33, 0.0, 0.2], [2.0, 0.0, 0.0]])
-    np.testing.assert_allclose(sample_grid(grid, points), [0.33, 2.0], atol=1e-9)

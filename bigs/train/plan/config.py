@@ -135,6 +135,9 @@ class ObjectMotionStage:
     name: str = "object-motion"
     step: StepKind = "single-subject"
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    # A camera whose exposure wavers sets itself, and few of those are calibrated: the chance that the given
+    # focal length was is no more than this.
+    calibrated_automatic: float = 0.5
 
 
 @dataclass(frozen=True)

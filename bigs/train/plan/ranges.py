@@ -22,6 +22,7 @@ from bigs.train.plan.config import (
     GraspStage,
     GuidanceStage,
     MoveStage,
+    ObjectMotionStage,
     OpeningConfig,
     OptimizeStage,
     RefineStage,
@@ -113,6 +114,7 @@ RANGES: dict[type, dict[str, Range]] = {
         "image_size": _PIXELS,
     },
     MoveStage: {"image_size": _PIXELS, "best": _COUNT, "gain": _SHARE, "loose_gain": _SHARE},
+    ObjectMotionStage: {"calibrated_automatic": _SHARE},
     TrackerConfig: {
         "overlap": _COUNT,
         "turn_sigma": _POSITIVE,

@@ -83,12 +83,11 @@ def _trust(valid: np.ndarray, transl: Tensor, config: InitialConfig) -> Tensor:
 
 def smooth_hand(start: HandStart, sigma: float) -> HandStart:
     """Robustly smoothed rotations and position; ray and log depth apart, since their noises differ."""
-    pose = torch.stack(
-        [smooth_rotations(start.hand_pose[:, j], start.trust, sigma) for j in range(15)], dim=1
-    )
+    rotations = torch.cat([start.global_orient[:, None], start.hand_pose], dim=1).transpose(0, 1)
+    global_orient, *hand_pose = smooth_rotations(rotations, start.trust, sigma)
     return HandStart(
-        smooth_rotations(start.global_orient, start.trust, sigma),
-        pose,
+        global_orient,
+        torch.stack(hand_pose, dim=1),
         _smooth_positions(start.wrist, start.trust, sigma),
         start.trust,
     )

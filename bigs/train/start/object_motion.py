@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from bigs.geometry.arrays import float32
 from bigs.models.poses import PoseErrors
 from bigs.motion.given_poses import GivenPoses
 from bigs.motion.tracker import TrackedMotion, track
+from bigs.motion.tracker_config import TrackerConfig
 from bigs.threads import side_by_side
 from bigs.train.plan.config import ObjectMotionStage
 from bigs.train.plan.start_config import InitialConfig
@@ -56,12 +57,21 @@ def find_object_motion(
     # darken and lighten.
     images = side_by_side(clip.image_as_taken, range(len(clip)))
     masks = np.stack(side_by_side(clip.mask, range(len(clip)))) == MASK_VALUES["object"]
-    found = track(images, masks, np.asarray(clip.K, dtype=np.float64), given, stage.tracker)
+    found = track(images, masks, np.asarray(clip.K, dtype=np.float64), given, _tracker(clip, stage))
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / FILE_NAME) as file:
             np.savez(file, digest=np.str_(digest), **found._asdict())
     return found
+
+
+def _tracker(clip: Clip, stage: ObjectMotionStage) -> TrackerConfig:
+    """The tracker's settings, with what the clip's exposure says of its focal length."""
+    focal = stage.tracker.focal
+    if clip.gains is None or focal.calibrated >= 1.0:
+        return stage.tracker
+    chance = min(focal.calibrated, stage.calibrated_automatic)
+    return replace(stage.tracker, focal=replace(focal, calibrated=chance))
 
 
 def with_motion(start: ObjectStart, motion: TrackedMotion) -> ObjectStart:

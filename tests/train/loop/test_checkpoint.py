@@ -22,6 +22,7 @@ from bigs.data.base import Clip
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.fit import fit
+from bigs.train.fit_report import FitReport
 from bigs.train.loop.checkpoint import FILE_NAME, load_checkpoint, save_checkpoint
 from bigs.train.plan.config import GraspStage, OptimizeStage, RunConfig, Stage
 from bigs.train.plan.presets import SMOKE
@@ -30,7 +31,10 @@ from bigs.types import Side
 
 
 def short_plan() -> RunConfig:
-    """Every kind of stage of the smoke preset, four steps each; three steps between checkpoints."""
+    """Every kind of stage of the smoke preset, four steps each, and one that is skipped.
+
+    Three steps between checkpoints.
+    """
 
     def short(stage: Stage) -> Stage:
         if isinstance(stage, OptimizeStage):
@@ -38,8 +42,9 @@ def short_plan() -> RunConfig:
         # Hands hold the bottle all the time. Stricter grasps leave frames to the stage of those without.
         return replace(stage, excess=0.2) if isinstance(stage, GraspStage) else stage
 
-    stages = tuple(short(stage) for stage in copy.deepcopy(SMOKE.stages) if stage.name != "hands-fine")
-    return resolve(replace(SMOKE, stages=stages, checkpoint_every=3)).config
+    stages = [short(stage) for stage in copy.deepcopy(SMOKE.stages) if stage.name != "hands-fine"]
+    never = replace(stages[0], name="never", weights={})
+    return resolve(replace(SMOKE, stages=(never, *stages), checkpoint_every=3)).config
 
 
 class Interrupted(Exception):
@@ -61,9 +66,13 @@ def interrupt_after(events: int) -> Any:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tiny: Clip, both_hands: dict[Side, HandModel]) -> dict[str, Tensor]:
-    scene, _ = fit(tiny, both_hands, short_plan())
-    return scene.state_dict()
+def whole(tiny: Clip, both_hands: dict[Side, HandModel]) -> tuple[Scene, FitReport]:
+    return fit(tiny, both_hands, short_plan())
+
+
+@pytest.fixture(scope="module")
+def undisturbed(whole: tuple[Scene, FitReport]) -> dict[str, Tensor]:
+    return whole[0].state_dict()
 
 
 def assert_same(scene: Scene, expected: dict[str, Tensor]) -> None:
@@ -73,12 +82,16 @@ def assert_same(scene: Scene, expected: dict[str, Tensor]) -> None:
     assert not differing
 
 
-def test_keeping_checkpoints_changes_nothing(
+def test_keeping_checkpoints_changes_nothing_and_a_finished_fit_is_not_run_again(
     tiny: Clip, both_hands: dict[Side, HandModel], undisturbed: dict[str, Tensor], tmp_path: Path
 ) -> None:
     scene, _ = fit(tiny, both_hands, short_plan(), checkpoints=tmp_path)
     assert_same(scene, undisturbed)
     assert [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
+    events: list[Any] = []
+    scene, _ = fit(tiny, both_hands, short_plan(), checkpoints=tmp_path, resume=True, listen=events.append)
+    assert_same(scene, undisturbed)
+    assert [event["event"] for event in events] == ["resume"]
 
 
 @pytest.mark.slow
@@ -111,11 +124,12 @@ def test_a_resumed_fit_is_the_undisturbed_one(
 
 @pytest.mark.slow
 def test_interrupted_again_and_again(
-    tiny: Clip, both_hands: dict[Side, HandModel], undisturbed: dict[str, Tensor], tmp_path: Path
+    tiny: Clip, both_hands: dict[Side, HandModel], whole: tuple[Scene, FitReport], tmp_path: Path
 ) -> None:
+    """The scene is the same, and the report has the stages that were over before the interruption."""
     for _ in range(8):
         try:
-            scene, _ = fit(
+            scene, report = fit(
                 tiny,
                 both_hands,
                 short_plan(),
@@ -126,17 +140,12 @@ def test_interrupted_again_and_again(
         except Interrupted:
             continue
         break
-    assert_same(scene, undisturbed)
-
-
-def test_a_finished_fit_is_not_run_again(
-    tiny: Clip, both_hands: dict[Side, HandModel], undisturbed: dict[str, Tensor], tmp_path: Path
-) -> None:
-    fit(tiny, both_hands, short_plan(), checkpoints=tmp_path)
-    events: list[Any] = []
-    scene, _ = fit(tiny, both_hands, short_plan(), checkpoints=tmp_path, resume=True, listen=events.append)
-    assert_same(scene, undisturbed)
-    assert [event["event"] for event in events] == ["resume"]
+    assert_same(scene, whole[0].state_dict())
+    expected = whole[1]
+    assert "never: no loss term is left" in expected.skipped
+    assert report.skipped == expected.skipped
+    assert list(report.seconds) == list(expected.seconds)
+    assert 0 < report.before < sum(report.seconds.values())
 
 
 def test_the_stopping_rule_survives_an_interruption(
@@ -147,7 +156,7 @@ def test_the_stopping_rule_survives_an_interruption(
     The report tells what the steps that were not taken would have cost, and fields that nothing trained.
     """
     still = replace(
-        short_plan().stages[0],
+        short_plan().stages[1],
         steps=30,
         lrs={"hand.ray": 1e-9},
         weights={"image": 1.0},
@@ -280,31 +289,6 @@ def test_changed_bits_are_found(both_hands: dict[Side, HandModel], tmp_path: Pat
         (tmp_path / FILE_NAME).write_bytes(changed)
         with pytest.raises(InputError, match=r"latest\.safetensors: expected (a checkpoint, found|format)"):
             load_checkpoint(tmp_path, scene, "abc")
-
-
-def test_an_interrupted_runs_report_is_whole(
-    tiny: Clip, both_hands: dict[Side, HandModel], tmp_path: Path
-) -> None:
-    """Seconds and skipped lines of stages that were over before the interruption."""
-    config = short_plan()
-    never = replace(config.stages[0], name="never", weights={})
-    config = replace(config, stages=(never, *config.stages))
-    _, expected = fit(tiny, both_hands, config)
-    assert "never: no loss term is left" in expected.skipped
-    report = None
-    for _ in range(9):
-        try:
-            _, report = fit(
-                tiny, both_hands, config, checkpoints=tmp_path, resume=True, listen=interrupt_after(6)
-            )
-        except Interrupted:
-            continue
-        break
-    assert report is not None
-    assert report.seconds.keys() == expected.seconds.keys()
-    assert list(report.seconds) == list(expected.seconds)
-    assert report.skipped == expected.skipped
-    assert 0 < report.before < sum(report.seconds.values())
 
 
 def test_another_format_is_named(both_hands: dict[Side, HandModel], tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
 from bigs.motion.given_poses import GivenPoses
 from bigs.motion.tracker import TrackedMotion
+from bigs.motion.tracker_config import TrackerConfig
 from bigs.train.check_plan import check_plan
 from bigs.train.fit import fit
 from bigs.train.plan.config import ObjectMotionStage, OptimizeStage, RunConfig
@@ -104,6 +105,28 @@ def test_tracks_are_sought_in_the_pictures_as_they_were_taken(
     assert len(seen) == len(tiny)
     for t, image in enumerate(seen):
         np.testing.assert_array_equal(image, tiny.image(t))
+
+
+@pytest.mark.parametrize(
+    ("wavers", "given", "believed"), [(False, 0.8, 0.8), (True, 0.8, 0.5), (True, 0.3, 0.3), (True, 1.0, 1.0)]
+)
+def test_a_camera_that_sets_its_own_exposure_is_rarely_calibrated(
+    tiny: Clip, monkeypatch: pytest.MonkeyPatch, wavers: bool, given: float, believed: float
+) -> None:
+    """Unless the user says that it is, by `--without focal` for one."""
+    seen: list[float] = []
+
+    def track(
+        images: object, masks: object, K: object, poses: GivenPoses, config: TrackerConfig
+    ) -> TrackedMotion:
+        seen.append(config.focal.calibrated)
+        return tracked(poses)
+
+    monkeypatch.setattr(object_motion, "track", track)
+    clip = replace(tiny, gains=np.full((len(tiny), 3), 1.1, dtype=np.float32)) if wavers else tiny
+    tracker = replace(STAGE.tracker, focal=replace(STAGE.tracker.focal, calibrated=given))
+    find_object_motion(clip, SMOKE.initial, replace(STAGE, tracker=tracker), None)
+    assert seen == [believed]
 
 
 def test_a_clip_without_an_object_has_no_motion(tiny: Clip, calls: list[GivenPoses]) -> None:
