@@ -51,10 +51,16 @@ def plain(
 
 
 @pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Those of `completed`."""
+    return tmp_path_factory.mktemp("checkpoints")
+
+
+@pytest.fixture(scope="module")
 def completed(
-    bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel]
+    bottle: tuple[Clip, HandObjectTrajectory], both_hands: dict[Side, HandModel], checkpoints: Path
 ) -> tuple[Scene, FitReport]:
-    return fit(bottle[0], both_hands, PLAN)
+    return fit(bottle[0], both_hands, PLAN, checkpoints=checkpoints)
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], names: tuple[str, ...]) -> bool:
@@ -185,12 +191,13 @@ def test_a_completed_object_comes_back_from_its_checkpoint(
     bottle: tuple[Clip, HandObjectTrajectory],
     completed: tuple[Scene, FitReport],
     both_hands: dict[Side, HandModel],
-    tmp_path: Path,
+    checkpoints: Path,
 ) -> None:
     """Though it has other Gaussians, vertices and faces than the scene that a resumed run begins with."""
-    fit(bottle[0], both_hands, PLAN, checkpoints=tmp_path)
     events: list[dict[str, Any]] = []
-    scene, report = fit(bottle[0], both_hands, PLAN, checkpoints=tmp_path, resume=True, listen=events.append)
+    scene, report = fit(
+        bottle[0], both_hands, PLAN, checkpoints=checkpoints, resume=True, listen=events.append
+    )
     assert not any(event["event"] == "stage" for event in events)
     assert same(completed[0].state_dict(), scene.state_dict(), ("",))
     assert report.facts == completed[1].facts
