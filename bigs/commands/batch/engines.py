@@ -47,10 +47,10 @@ class Processes:
     def __init__(self) -> None:
         # Not forked from here: torch's and the engine's threads do not survive a fork. On Linux a server that
         # imports what a job needs, and uses none of it, is forked instead: that spares each attempt seconds.
-        self._context: Any = multiprocessing.get_context(
-            "forkserver" if platform.system() == "Linux" else "spawn"
-        )
-        self._context.set_forkserver_preload([run_job.__module__])
+        forks = platform.system() == "Linux"
+        self._context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
+        if forks:
+            self._context.set_forkserver_preload([run_job.__module__])
         self._running: dict[int, tuple[Any, Job]] = {}
 
     def submit(self, job: Job) -> None:
