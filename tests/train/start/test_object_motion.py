@@ -108,10 +108,22 @@ def test_tracks_are_sought_in_the_pictures_as_they_were_taken(
 
 
 @pytest.mark.parametrize(
-    ("wavers", "given", "believed"), [(False, 0.8, 0.8), (True, 0.8, 0.5), (True, 0.3, 0.3), (True, 1.0, 1.0)]
+    ("wavers", "given", "automatic", "believed"),
+    [
+        (False, 0.8, 0.5, 0.8),
+        (True, 0.8, 0.5, 0.5),
+        (True, 0.8, 0.2, 0.2),
+        (True, 0.3, 0.5, 0.3),
+        (True, 1.0, 0.5, 1.0),
+    ],
 )
 def test_a_camera_that_sets_its_own_exposure_is_rarely_calibrated(
-    tiny: Clip, monkeypatch: pytest.MonkeyPatch, wavers: bool, given: float, believed: float
+    tiny: Clip,
+    monkeypatch: pytest.MonkeyPatch,
+    wavers: bool,
+    given: float,
+    automatic: float,
+    believed: float,
 ) -> None:
     """Unless the user says that it is, by `--without focal` for one."""
     seen: list[float] = []
@@ -125,7 +137,8 @@ def test_a_camera_that_sets_its_own_exposure_is_rarely_calibrated(
     monkeypatch.setattr(object_motion, "track", track)
     clip = replace(tiny, gains=np.full((len(tiny), 3), 1.1, dtype=np.float32)) if wavers else tiny
     tracker = replace(STAGE.tracker, focal=replace(STAGE.tracker.focal, calibrated=given))
-    find_object_motion(clip, SMOKE.initial, replace(STAGE, tracker=tracker), None)
+    stage = ObjectMotionStage(tracker=tracker, calibrated_automatic=automatic)
+    find_object_motion(clip, SMOKE.initial, stage, None)
     assert seen == [believed]
 
 
