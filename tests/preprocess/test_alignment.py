@@ -14,8 +14,10 @@ from bigs.checks import InputError
 from bigs.data.base import HandTrack
 from bigs.data.formats.hold import load_hold
 from bigs.data.synthetic import make_clip
+from bigs.geometry.distance import DistanceField
+from bigs.geometry.surface import DistanceGrid
 from bigs.hand import HandModel, load_hand_models
-from bigs.preprocess.align import AlignConfig, align, cheapest_path, posed_vertices
+from bigs.preprocess.align import AlignConfig, align, cheapest_path, contact_costs, posed_vertices
 from bigs.preprocess.artefacts import ObjectSfm
 from bigs.preprocess.object.rough_surface import SurfaceConfig, rough_surface, sights
 from bigs.types import Side
@@ -180,3 +182,25 @@ def test_the_cheapest_path_is_the_cheapest_of_all() -> None:
     best = min(np.ndindex(4, 4, 4, 4), key=total)
     cost, path = cheapest_path(costs, config)
     assert tuple(path) == best and cost == pytest.approx(total(best))
+
+
+def flat(height: float) -> DistanceField:
+    """The half space below a height in metres, 10 cm to each side of the object's middle."""
+    levels = np.linspace(-0.1, 0.1, 21)
+    values = np.broadcast_to(levels - height, (21, 21, 21)).copy()
+    return DistanceField(DistanceGrid(values, np.full(3, -0.1), 0.01))
+
+
+@pytest.mark.parametrize(("height", "cost"), [(0.01, 0.5), (0.0, 0.0), (-0.01, 0.0), (-0.03, 1.4)])
+def test_hands_touch_what_may_be_there_and_are_never_in_what_is(height: float, cost: float) -> None:
+    """Above the outer surface they are too far; only below the solid one, 2 cm deeper, are they too deep."""
+    config = AlignConfig(saturation=0.01, penetration=2.0, depth=0.003)
+    hand = np.array([[[0.01 * x, 0.0, 0.5 + height] for x in range(-5, 5)]])
+    poses = (np.eye(3)[None], np.array([[0.0, 0.0, 0.5]]))
+    surfaces = (flat(0.0), flat(-0.02))
+    costs, shifts = contact_costs(
+        hand, np.array([[0.0, 0.0, 1.0]]), np.array([True]), poses, surfaces, 1.0, config
+    )
+    unmoved = np.abs(shifts[0]).argmin()
+    assert shifts[0, unmoved] == pytest.approx(0.0, abs=1e-12)
+    assert costs[0, unmoved] == pytest.approx(cost, abs=1e-3)
