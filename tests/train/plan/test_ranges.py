@@ -34,6 +34,7 @@ def test_every_range_is_of_a_number_that_exists() -> None:
         ("stages.joint.weights.my_term=-1", r"weights\.my_term: .* found -1"),
         ("stages.joint.lrs.hand.orient=-0.1", r"lrs\.hand\.orient: .* found -0.1"),
         ("stages.joint.lrs.hand.orient=1e300", r"lrs\.hand\.orient: .* found 1e\+300"),
+        ("stages.object-motion.calibrated_automatic=1.5", r"calibrated_automatic: .* found 1\.5"),
         ("stages.joint.steps=-1", r"joint\.steps: .* found -1"),
         ("stages.object-prior.t_first=[0.5, .nan]", r"t_first\[1\]: .* found nan"),
         ("hand.color=[0.5, 0.5, 1.0]", r"hand\.color\[2\]: .* less than 1, found 1"),
