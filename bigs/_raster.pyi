@@ -9,6 +9,7 @@ from bigs.raster.settings import RasterSettings
 
 __all__ = [
     "BundleSightings",
+    "OutlineState",
     "RasterState",
     "SymmetryJudge",
     "TouchState",
@@ -27,6 +28,8 @@ __all__ = [
     "harmonics_backward",
     "harmonics_forward",
     "lay_patches",
+    "outline_backward",
+    "outline_forward",
     "pose_backward",
     "pose_forward",
     "rasterize_backward",
@@ -163,6 +166,26 @@ def form_factors(arrays: tuple[NDArray[Any], ...]) -> NDArray[Any]:
 
     `arrays` are points and normals [B, N, 3], those of the discs [B, M, 3], and their areas [M].
     """
+
+@final
+class OutlineState:
+    """What a mesh covers, for the backward pass. Opaque; usable any number of times."""
+
+# Triangles [F, 3], and width and height of the picture.
+_OutlineOptions = tuple[NDArray[np.int64], tuple[int, int]]
+
+def outline_forward(
+    arrays: tuple[NDArray[Any], ...], options: _OutlineOptions
+) -> tuple[NDArray[Any], OutlineState]:
+    """Flat shares [B, H, W] of pixels that a mesh covers; `arrays` are points [B, V, 3] and K [3, 3]."""
+
+def outline_backward(
+    state: OutlineState,
+    arrays: tuple[NDArray[Any], ...],
+    options: _OutlineOptions,
+    v_shares: NDArray[Any],
+) -> NDArray[Any]:
+    """The flat gradient of the points from that of the shares."""
 
 def terms_together(
     arrays: tuple[NDArray[Any], ...], frames: tuple[int, ...], covered: float

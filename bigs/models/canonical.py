@@ -14,7 +14,7 @@ class CanonicalHand(NamedTuple):
     shapedirs: Tensor  # [N, 3, 10]
     posedirs: Tensor | None  # [N, 3, 135]; None when the model has none
     weights: Tensor  # [N, 16]
-    quats: Tensor | None  # [N, 4]; None for isotropic Gaussians
+    quats: Tensor  # [N, 4]
     scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
     colors: Tensor  # [N, D]

@@ -11,16 +11,12 @@ from torch import Tensor, nn
 
 from bigs.fields.decoders import AppearanceDecoder, DecoderConfig, GeometryDecoder, SkinningDecoder
 from bigs.fields.triplane import Triplane, TriplaneConfig
-from bigs.fused.posing import skin
 from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_spacing, vertex_normals
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.hand import HandModel
 from bigs.hand.lbs import pose_corrective
 from bigs.models.canonical import CanonicalHand
-from bigs.models.poses import HandFrames
-from bigs.models.posing import hand_part, pose_parts
-from bigs.types import Gaussians, Side
 
 
 @dataclass(frozen=True)
@@ -141,64 +137,10 @@ class HandSplats(nn.Module):
         )
 
 
-def silhouette_hand(model: HandModel, sigma: float, inset: float) -> CanonicalHand:
-    """Opaque isotropic Gaussians on the template's vertices: enough for silhouettes, and few.
-
-    Args:
-        model: the right hand.
-        sigma: standard deviation, metres.
-        inset: metres by which centres go in along the normal, so that the soft outline falls on the surface.
-    """
-    normals = vertex_normals(model.v_template.numpy().astype(np.float64), model.faces.numpy())
-    count = len(model.v_template)
-    return CanonicalHand(
-        model.v_template - inset * torch.as_tensor(normals, dtype=torch.float32),
-        model.shapedirs,
-        model.posedirs if model.has_posedirs else None,
-        model.lbs_weights,
-        None,
-        torch.full((count, 3), sigma),
-        torch.ones(count),
-        torch.ones(count, 1),
-    )
-
-
-def pose_hand(
-    model: HandModel, hand: CanonicalHand, betas: Tensor, frames: HandFrames, side: Side
-) -> Gaussians:
-    """Carry canonical Gaussians to B frames, in camera space (paper Eq. 3; a left hand is mirrored).
-
-    Args:
-        model: the right hand.
-        hand: its Gaussians.
-        betas: [10].
-        frames: poses of the canonical (right) hand: for a left hand, of its mirror image.
-        side: which hand to show.
-    """
-    skeleton = model.skeleton(betas, frames.hand_pose, frames.global_orient, frames.wrist)
-    return pose_splats(hand, betas, frames.hand_pose, skeleton.bone_transforms, side)
-
-
-def pose_splats(
-    hand: CanonicalHand, betas: Tensor, hand_pose: Tensor, bones: Tensor, side: Side
-) -> Gaussians:
-    """The same along bones [B, 16, 4, 4] that are known; hand_pose [B, 15, 3, 3] is for the correctives."""
-    return skin_hand(hand, rest_points(hand, betas, hand_pose), bones, side)
-
-
 def rest_points(hand: CanonicalHand, betas: Tensor, hand_pose: Tensor) -> Tensor:
     """Shaped points [N, 3] before skinning, or [B, N, 3] where fingers [B, 15, 3, 3] correct them."""
     points = hand.points + hand.shapedirs @ betas
     return points if hand.posedirs is None else points + pose_corrective(hand.posedirs, hand_pose)
-
-
-def skin_hand(hand: CanonicalHand, points: Tensor, bones: Tensor, side: Side) -> Gaussians:
-    """Carry shaped rest points [N, 3] or [B, N, 3] along the bones [B, 16, 4, 4] of B frames."""
-    part = hand_part(hand, points, bones, side)
-    if hand.quats is not None:
-        return pose_parts([part])
-    quats = points.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(hand.scales), 4)
-    return Gaussians(skin(part.posing), quats, hand.scales, hand.opacities, hand.colors)
 
 
 def neighbour_weights(points: np.ndarray, verts: Tensor, lbs_weights: Tensor, neighbours: int = 6) -> Tensor:

@@ -14,7 +14,7 @@ from bigs.fused.touch import Group, Touch
 from bigs.geometry.distance import WHOLE_HAND
 from bigs.hand import Skeleton, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
-from bigs.models.hand_splats import pose_splats, rest_points
+from bigs.models.hand_splats import rest_points
 from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.models.posing import Covered, Part, hand_part, object_part, pose_parts
 from bigs.types import Entity, Gaussians, Side
@@ -109,11 +109,6 @@ class PosedScene:
         lighting = self._scene.lighting
         parts = [self._part(entity, splats) for entity, splats in canonical.items()]
         return pose_parts(parts, None if lighting is None else lighting.clip, labels)
-
-    def posed_hand(self, side: Side, hand: CanonicalHand) -> Gaussians:
-        """Any Gaussians of the canonical hand, unlit."""
-        bones, betas = self._skeleton(side).bone_transforms, self._scene.hand_betas(side)
-        return pose_splats(hand, betas, self.hand(side).hand_pose, bones, side)
 
     def _part(self, entity: Entity, canonical: CanonicalHand | CanonicalObject) -> Part:
         if entity == "object":

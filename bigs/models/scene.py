@@ -8,18 +8,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from bigs.fused.posing import skin
 from bigs.geometry.distance import DistanceField
 from bigs.hand import HandModel, mirror_points
 from bigs.models.canonical import CanonicalHand, CanonicalObject
 from bigs.models.grasps import Grasps
 from bigs.models.hand_detail import HandDetail
-from bigs.models.hand_splats import HandSplats, pose_splats
+from bigs.models.hand_splats import HandSplats
 from bigs.models.lighting import Lighting
 from bigs.models.object_detail import ObjectDetail
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.posed_scene import PosedScene
 from bigs.models.poses import HandFrames, HandPoses, ObjectPoses
-from bigs.types import SIDES, Entity, Gaussians, Side
+from bigs.types import SIDES, Entity, Side
 
 
 @dataclass(frozen=True)
@@ -156,12 +157,12 @@ class Scene(nn.Module):
         """Hands and object at `frames` [B]."""
         return PosedScene(self, frames)
 
-    def posed_hand(self, side: Side, poses: HandFrames, hand: CanonicalHand) -> Gaussians:
-        """Any Gaussians of the canonical hand in any poses of a side [B], unlit, in camera space."""
+    def hand_verts(self, side: Side, poses: HandFrames) -> Tensor:
+        """Vertices [B, V, 3] of a hand in any poses of a side [B], in camera space, metres."""
         model, betas = self.hand_model(side), self.hand_betas(side)
         wrist = mirror_points(poses.wrist) if side == "left" else poses.wrist
         skeleton = model.skeleton(betas, poses.hand_pose, poses.global_orient, wrist)
-        return pose_splats(hand, betas, poses.hand_pose, skeleton.bone_transforms, side)
+        return skin(model.posing(skeleton, poses.hand_pose)._replace(mirrored=side == "left"))
 
     def free_frames(self, side: Side) -> Tensor:
         """Indices [F] of the frames in which a hand belongs to no grasp, rising."""

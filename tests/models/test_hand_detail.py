@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from posed_hands import pose_hand
 
 from bigs.models.hand_detail import HandDetail, free_hand
-from bigs.models.hand_splats import HandSplats, HandSplatsConfig, pose_hand
+from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.poses import HandFrames
 
 

@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 import scipy.spatial
 import torch
+from posed_hands import pose_hand
 from posing_twin import third_axis
 from small_scene import HAND, covariances, disturb, hand_model, rotations
 
 from bigs.fused.posing import Posing, pose
-from bigs.geometry.mesh import midpoint_subdivision, point_spacing, vertex_normals
+from bigs.geometry.mesh import midpoint_subdivision, point_spacing
 from bigs.geometry.rotations import axis_angle_to_matrix, matrix_to_quat, quat_to_matrix
 from bigs.hand import mirror_points
-from bigs.models.canonical import CanonicalHand
 from bigs.models.hand_splats import (
     HandSplats,
     neighbour_weights,
-    pose_hand,
-    silhouette_hand,
-    skin_hand,
 )
 from bigs.models.poses import HandFrames
+from bigs.models.posing import hand_part, pose_parts
 
 BETAS = torch.randn(10, generator=torch.Generator().manual_seed(0))
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
@@ -156,7 +154,7 @@ def test_a_gaussian_of_one_bone_turns_with_that_bone() -> None:
     model, pose = hand_model(rich=True), frames()
     bones = model(BETAS, pose.hand_pose, pose.global_orient, pose.wrist).bone_transforms
     one_bone = splats()()._replace(weights=torch.eye(16)[torch.arange(len(model.v_template)) % 16])
-    posed = skin_hand(one_bone, one_bone.points, bones, "right")
+    posed = pose_parts([hand_part(one_bone, one_bone.points, bones, "right")])
     resting = covariances(posed._replace(quats=one_bone.quats))
     turns = bones[:, torch.arange(len(one_bone.points)) % 16, :3, :3]
     torch.testing.assert_close(covariances(posed), turns @ resting @ turns.mT, atol=1e-10, rtol=1e-4)
@@ -200,26 +198,6 @@ def test_a_model_without_correctives_poses_like_one_with_zeros() -> None:
     zeros = hand._replace(posedirs=torch.zeros(len(hand.points), 3, 135))
     with_zeros = pose_hand(made.model, zeros, BETAS, frames(), "right")
     torch.testing.assert_close(pose_hand(made.model, hand, BETAS, frames(), "right").means, with_zeros.means)
-
-
-@torch.no_grad()
-def test_silhouette_hands_are_opaque_balls_below_the_surface() -> None:
-    model = hand_model(rich=True)
-    hand = silhouette_hand(model, sigma=0.002, inset=0.0015)
-    assert isinstance(hand, CanonicalHand)
-    normals = vertex_normals(model.v_template.numpy(), model.faces.numpy())
-    inwards = model.v_template - 0.0015 * torch.as_tensor(normals)
-    torch.testing.assert_close(hand.points, inwards, atol=1e-6, rtol=0)
-    assert torch.equal(hand.weights, model.lbs_weights)
-    pose = frames()
-    left = pose_hand(model, hand, BETAS, pose, "left")
-    torch.testing.assert_close(
-        covariances(left._replace(quats=left.quats[None])),
-        (0.002**2 * torch.eye(3)).expand(1, len(hand.points), 3, 3),
-    )
-    vertices = model(BETAS, pose.hand_pose, pose.global_orient, pose.wrist).vertices
-    assert ((left.means - mirror_points(vertices)).norm(dim=-1) < 0.0016).all()
-    assert (left.opacities == 1).all() and left.colors.shape == (len(hand.points), 1)
 
 
 def test_neighbour_weights_are_a_vertexs_own_on_it_and_a_mean_between() -> None:

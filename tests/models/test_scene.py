@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+from posed_hands import pose_hand
 from posing_twin import quadratic_basis, third_axis
 from small_scene import FRAMES, OBJECT_RADIUS, hand_model, make_scene, rotations
 
 from bigs.geometry.rotations import quat_to_matrix
 from bigs.hand import mirror_points, mirror_rotation
-from bigs.models.hand_splats import pose_hand
 from bigs.models.scene import Scene
 
 ALL = torch.arange(FRAMES)

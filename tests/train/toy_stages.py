@@ -11,7 +11,6 @@ from torch import Tensor
 from toy_scenes import cube_scene
 
 from bigs.hand import HandModel, bends, impossible_turns
-from bigs.models.hand_splats import silhouette_hand
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
 from bigs.train.loop.step import Evidence
@@ -52,10 +51,9 @@ def random_evidence(scene: Scene) -> Evidence:
         height,
     )
     touching = {side: torch.ones(FRAMES) for side in ("right", "left")}
-    outlines = {side: silhouette_hand(scene.hand_model(side), 0.003, 0.004) for side in scene.sides}
     turns = {side: impossible_turns(scene.hand_model(side)) for side in scene.sides}
     bending = {side: bends(scene.hand_model(side)) for side in scene.sides}
-    return Evidence(targets, touching, outlines, turns, bending, "surface", RasterSettings(), small_network())
+    return Evidence(targets, touching, turns, bending, "surface", RasterSettings(), small_network())
 
 
 def values(scene: Scene) -> dict[str, Tensor]:

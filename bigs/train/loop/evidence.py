@@ -10,15 +10,12 @@ from torch import Tensor
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import bends, impossible_turns
 from bigs.losses.perceptual import VggWeights
-from bigs.models.canonical import CanonicalHand
-from bigs.models.hand_splats import silhouette_hand
 from bigs.models.poses import HandFrames
 from bigs.models.scene import Scene
 from bigs.train.grasps.find import Mismatch
 from bigs.train.loop.image_terms import labels
 from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.loop.target_source import TargetSource
-from bigs.train.loop.targets import Targets
 from bigs.train.plan.config import (
     GraspStage,
     MoveStage,
@@ -29,12 +26,6 @@ from bigs.train.plan.config import (
 )
 from bigs.train.start.initial import touching_frames
 from bigs.types import Side
-
-# Standard deviation of the Gaussians that represent a hand in the silhouette term, metres.
-SILHOUETTE_SIGMA = 0.0022
-# Centres are moved inwards by this many standard deviations of a Gaussian in the image. Opaque neighbours
-# overlap, so their common alpha falls to one half well outside the centres.
-INSET = 2.0
 
 
 class EvidenceSource:
@@ -86,11 +77,9 @@ class EvidenceSource:
     ) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets.at(stage.image_size)
-        silhouettes = {side: self._silhouette(side, targets) for side in self.scene.sides}
         return Evidence(
             targets,
             self.touching(),
-            silhouettes,
             {side: impossible_turns(self.scene.hand_model(side)) for side in self.scene.sides},
             {side: bends(self.scene.hand_model(side)) for side in self.scene.sides},
             self.config.contact,
@@ -117,8 +106,7 @@ class EvidenceSource:
         areas = {side: targets.shares[side].sum((1, 2)) for side in self.scene.sides}
 
         def ask(side: Side, poses: HandFrames, frames: Tensor) -> Tensor:
-            posed = self.scene.posed_hand(side, poses, evidence.silhouettes[side])
-            alphas = step.render(posed).alphas.squeeze(-1)
+            alphas = step.covered(side, self.scene.hand_verts(side, poses))
             own, hidden = targets.shares[side][frames], targets.hidden[side][frames]
             nearest = alphas.detach().clamp(own, own + hidden)
             squares = (alphas - nearest).square().sum((1, 2))
@@ -127,15 +115,3 @@ class EvidenceSource:
             return torch.where(shown[frames], squares / area[frames], torch.nan)
 
         return ask
-
-    def _silhouette(self, side: Side, targets: Targets) -> CanonicalHand:
-        """A hand whose outline lies right at this resolution.
-
-        The rasteriser widens every Gaussian by eps2d square pixels, so the coarser the image, the further in
-        the centres must go.
-        """
-        model = self.scene.hand_model(side)
-        depth = self.scene.hand_poses[side].position.base_log_depth.exp().median()
-        pixel = float(depth / targets.K[0, 0])
-        spread = (SILHOUETTE_SIGMA**2 + self.config.raster.eps2d * pixel**2) ** 0.5
-        return silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread)

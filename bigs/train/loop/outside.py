@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from bigs.fused.outline import covered_shares
 from bigs.fused.pixels import alone_terms, together_terms
 from bigs.train.loop.step import Selection, Step
 from bigs.train.loop.targets import Targets
@@ -42,21 +43,27 @@ def _seconds_of_nothing(step: Step, rows: int, views: int, channels: int) -> flo
     tries = []
     for _ in range(_TRIES):
         began = time.perf_counter()
-        rendered = blank.render(_no_gaussians(views, channels))
         against = (nowhere.images, black, black)
+        colors, alphas = _nothing(blank, views, channels)
         terms: Sequence[Tensor]
-        if channels > 3:
+        if colors is not None and channels > 3:
             labels = [black] * (channels - 3)
-            terms = together_terms(rendered.colors, rendered.alphas, *against, labels, frames, 1.0)
+            terms = together_terms(colors, alphas, *against, labels, frames, 1.0)
         else:
-            terms = alone_terms(rendered.colors if channels == 3 else None, rendered.alphas, *against, frames)
+            terms = alone_terms(colors, alphas, *against, frames)
         torch.stack(list(terms)).sum().backward()
         tries.append(time.perf_counter() - began)
     return min(tries)
 
 
-def _no_gaussians(views: int, channels: int) -> Gaussians:
+def _nothing(blank: Step, views: int, channels: int) -> tuple[Tensor | None, Tensor]:
+    """Colours, if there are channels, and alphas of no Gaussians, or else of no mesh."""
+    if channels == 0:
+        targets, points = blank.evidence.targets, torch.zeros(views, 0, 3, requires_grad=True)
+        no_faces = torch.zeros(0, 3, dtype=torch.long)
+        return None, covered_shares(points, no_faces, targets.K, targets.width, targets.height)[..., None]
     means, quats, scales, opacities, colors = (
         torch.zeros(views, 0, *size, requires_grad=True) for size in ((3,), (4,), (3,), (), (channels,))
     )
-    return Gaussians(means, quats, scales, opacities, colors)
+    rendered = blank.render(Gaussians(means, quats, scales, opacities, colors))
+    return rendered.colors, rendered.alphas

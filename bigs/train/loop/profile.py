@@ -152,12 +152,11 @@ def profiled() -> Iterator[Profile]:
     """A profile of what runs inside; its `listen` must hear the run's events."""
     profile = Profile()
     functions: list[tuple[Any, str, str]] = [
-        *(
-            (PosedScene, name, _POSING)
-            for name in ("posed", "posed_hand", "verts", "joints", "object_points")
-        ),
+        *((PosedScene, name, _POSING) for name in ("posed", "verts", "joints", "object_points")),
         (step, "rasterization", _ENGINE),
+        (step, "covered_shares", _ENGINE),
         (rust._raster, "rasterize_backward", _ENGINE_BACK),
+        (rust._raster, "outline_backward", _ENGINE_BACK),
         (torch.Tensor, "backward", _BACK),
         (FrameAdam, "step_frames", _OPTIMISER),
     ]

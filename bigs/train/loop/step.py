@@ -8,7 +8,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from bigs.checks import InputError
 from bigs.fused.fingers import FingerCosts, finger_costs
+from bigs.fused.outline import covered_shares
 from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
 from bigs.fused.touch import Touch
 from bigs.geometry.spread import spread
@@ -30,7 +32,6 @@ class Evidence:
 
     targets: Targets
     touching: dict[Side, Tensor]  # [T] 1 where a hand touches the object, as far as known
-    silhouettes: dict[Side, CanonicalHand]  # cheap opaque hands for this resolution
     impossible_turns: dict[Side, Tensor]  # [M, 15, 3, 3] what finger joints cannot do, of canonical hands
     bends: dict[Side, Tensor]  # [2, 2, 4, 15, 3, 3] how far finger joints bend, of canonical hands
     contact: str  # "center" or "surface"
@@ -64,7 +65,7 @@ class Step:
     evidence: Evidence
     canonical: dict[Entity, CanonicalHand | CanonicalObject]  # of the selection's entities
     selection: Selection
-    # Views and channels of each rendering made so far.
+    # Views and channels of each rendering made so far; what a mesh covers has none.
     pictures: list[tuple[int, int]] = field(default_factory=list)
     _alone: dict[Entity, RenderOutput] = field(default_factory=dict)
     _alone_terms: dict[Entity, AloneTerms] = field(default_factory=dict)
@@ -217,12 +218,21 @@ class Step:
         return self._alone_terms[entity]
 
     def silhouette(self, side: Side) -> Tensor:
-        """How far the outline of a hand's few opaque Gaussians is from what its own mask allows, a scalar.
+        """How far what a hand's mesh covers is from what its own mask allows, a scalar.
 
         See `losses.mask.amodal_silhouette`.
         """
-        posed = self.posed_clip.at(self.frames_of(side)).posed_hand(side, self.evidence.silhouettes[side])
-        return self._against_own(side, None, self.render(posed).alphas).coverage
+        verts = self.posed_clip.at(self.frames_of(side)).verts(side)
+        return self._against_own(side, None, self.covered(side, verts)[..., None]).coverage
+
+    def covered(self, side: Side, verts: Tensor) -> Tensor:
+        """The share [B, H, W] of each pixel that a hand covers whose vertices are at `verts` [B, V, 3]."""
+        targets, faces = self.evidence.targets, self.scene.hand_model(side).faces
+        self.pictures.append((len(verts), 0))
+        try:
+            return covered_shares(verts, faces, targets.K, targets.width, targets.height)
+        except ValueError as error:
+            raise InputError(str(error)) from None
 
     def _against_own(self, entity: Entity, colors: Tensor | None, alphas: Tensor) -> AloneTerms:
         targets = self.evidence.targets

@@ -133,7 +133,7 @@ _MOVES = MoveStage(
     weights={**_FINGER_PRIORS, "acceleration": 0.002, "depth_prior": 1.0},
 )
 # Between grasps nothing carries a hand, and a few frames decide: many steps for them alone. Their depth is
-# read off the size of outlines, which must be right to a fraction of a per cent (see `evidence.INSET`).
+# read off the size of outlines.
 _REGRASP = OptimizeStage(
     name="regrasp",
     step="single-subject",

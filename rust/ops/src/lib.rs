@@ -27,6 +27,7 @@ pub mod joints;
 mod lanes;
 mod mat3;
 pub mod occlusion;
+pub mod outline;
 pub mod pixels;
 pub mod pose;
 pub mod touch;

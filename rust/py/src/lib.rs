@@ -7,6 +7,7 @@ mod fingers;
 mod hand_poses;
 mod measure;
 mod occlusion;
+mod outline;
 mod pixels;
 mod pose;
 mod poses;
@@ -335,6 +336,9 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(fingers::finger_costs_forward, m)?)?;
     m.add_function(wrap_pyfunction!(fingers::finger_costs_backward, m)?)?;
     m.add_function(wrap_pyfunction!(occlusion::form_factors, m)?)?;
+    m.add_class::<outline::OutlineState>()?;
+    m.add_function(wrap_pyfunction!(outline::outline_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(outline::outline_backward, m)?)?;
     m.add_function(wrap_pyfunction!(touch::distances, m)?)?;
     m.add_function(wrap_pyfunction!(touch::touch_forward, m)?)?;
     m.add_function(wrap_pyfunction!(touch::touch_backward, m)?)?;

@@ -9,6 +9,7 @@ import pytest
 import torch
 from toy_stages import ALONE, TOGETHER
 
+from bigs.fused.outline import covered_shares
 from bigs.models.scene import Scene
 from bigs.raster import rasterization
 from bigs.train.loop.outside import seconds_outside
@@ -40,7 +41,7 @@ def finished_step(scene: Scene, evidence: Evidence, kind: str, entities: tuple[E
 
 
 @pytest.mark.parametrize(
-    ("kind", "channels"), [("single-subject", [3, 3, 3, 1, 1]), ("interacting-subjects", [6, 1, 1])]
+    ("kind", "channels"), [("single-subject", [3, 3, 3, 0, 0]), ("interacting-subjects", [6, 0, 0])]
 )
 def test_every_picture_counts_with_what_it_leaves_out(
     scene: Scene, evidence: Evidence, kind: str, channels: list[int], monkeypatch: pytest.MonkeyPatch
@@ -55,12 +56,18 @@ def test_every_picture_counts_with_what_it_leaves_out(
         clock.now += height
         return rasterization(means, *arguments, **options)
 
+    def watched_outline(points: torch.Tensor, *arguments: int) -> torch.Tensor:
+        drawn.append((len(points), points.shape[1], 0, *arguments[-2:]))
+        clock.now += arguments[-1]
+        return covered_shares(points, *arguments)
+
     monkeypatch.setattr("bigs.train.loop.step.rasterization", watched)
+    monkeypatch.setattr("bigs.train.loop.outside.covered_shares", watched_outline)
     monkeypatch.setattr("bigs.train.loop.outside.time", SimpleNamespace(perf_counter=lambda: clock.now))
     before = {name: p.grad.clone() for name, p in scene.named_parameters() if p.grad is not None}
     # A row takes a second here.
     assert seconds_outside(step) == pytest.approx(12 * len(channels))
-    # Each twice, of which the shorter counts; no Gaussians; all 30 rows, of which 12 are not looked at.
+    # Each twice, of which the shorter counts; nothing to draw; all 30 rows, of which 12 are not looked at.
     assert drawn[::2] == drawn[1::2] == [(2, 0, count, 40, 30) for count in channels]
     # Nothing reaches the scene.
     assert all(torch.equal(p.grad, before[name]) for name, p in scene.named_parameters() if name in before)

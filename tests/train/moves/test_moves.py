@@ -14,15 +14,14 @@ from toy_scenes import cube_scene
 
 from bigs.checks import InputError
 from bigs.fused.fingers import finger_costs
+from bigs.fused.outline import covered_shares
 from bigs.geometry.rotations import axis_angle_to_matrix, rotation_angle
 from bigs.hand import HandModel
-from bigs.models.hand_splats import silhouette_hand
 from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.models.scene import Scene
-from bigs.raster import RasterSettings, rasterization
 from bigs.train.check_plan import check_plan
 from bigs.train.grasps.find import Mismatch
-from bigs.train.loop.evidence import INSET, SILHOUETTE_SIGMA, EvidenceSource
+from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.targets import Targets
 from bigs.train.moves.search import search_moves
 from bigs.train.moves.trials import Trials
@@ -54,15 +53,10 @@ def waving(both_hands: Mapping[Side, HandModel]) -> Scene:
 
 def pictures_of(scene: Scene) -> EvidenceSource:
     """What masks say of the scene as it is."""
-    model = scene.hand_model("right")
-    pixel = 0.5 / float(scene.K[0, 0])
-    spread = (SILHOUETTE_SIGMA**2 + RasterSettings().eps2d * pixel**2) ** 0.5
-    outline = silhouette_hand(model, SILHOUETTE_SIGMA, INSET * spread)
 
     def shown(side: Side) -> Tensor:
-        posed = scene.at(ALL).posed_hand(side, outline)
-        eye = torch.eye(4)[None]
-        return rasterization(*posed, eye, scene.K[None], scene.width, scene.height).alphas[:, 0, ..., 0]
+        faces = scene.hand_model(side).faces
+        return covered_shares(scene.at(ALL).verts(side), faces, scene.K, scene.width, scene.height)
 
     with torch.no_grad():
         shares = {side: shown(side) for side in SIDES}
