@@ -1,6 +1,6 @@
-//! What a step of fitting hands and an object does around the renderer: posing Gaussians, comparing images, measuring
-//! distances, turning joints, what fingers cost, and how surfaces cover each other. Each is one pass over its data, with
-//! its gradient derived by hand where one is taken, for `f32` and `f64` from the same source.
+//! What a step of fitting hands and an object does around the renderer: posing Gaussians, covering pixels by a mesh,
+//! comparing images, measuring distances, turning joints, what fingers cost, and how surfaces cover each other. Each is one
+//! pass over its data, with its gradient derived by hand where one is taken, for `f32` and `f64` from the same source.
 //!
 //! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
 //! shared among rayon's threads in pieces of a fixed size, and sums have a fixed order, so that the number of threads
