@@ -97,13 +97,17 @@ class _Search:
         self._write(let_go, carried.poses.wrist)
         return Moved(int(free.sum()), len(self._renewed), sorted(let_go))
 
+    def _usual(self) -> Tensor:
+        """How far outlines disagree that are as right as they get."""
+        return self._now.mismatch.nanmedian().clamp_min(self._stage.exact)
+
     def _loose_ends(self) -> list[list[int]]:
         """Frames in which a carried hand does not suit the picture, inwards from each end of each grasp."""
         of_frame, mismatch = self._scene.grasps[self._side].of_frame, self._now.mismatch
         found = []
         for grasp in range(self._scene.grasps[self._side].count):
             frames = torch.nonzero(of_frame == grasp).flatten().tolist()
-            usual = max(mismatch[frames].nanmedian(), mismatch.nanmedian())
+            usual = max(mismatch[frames].nanmedian(), self._usual())
             for inwards in (frames, frames[::-1]):
                 end: list[int] = []
                 while len(end) < min(self._stage.loose_frames, len(frames) - _KEPT):
@@ -118,8 +122,7 @@ class _Search:
 
     def _spread(self, moves: list[int], first: bool) -> bool:
         """Let wrong frames among `moves` try other poses; whether any has taken one."""
-        mismatch = self._now.mismatch
-        usual = mismatch.nanmedian()
+        mismatch, usual = self._now.mismatch, self._usual()
         frames: list[int] = []
         starts: list[HandFrames] = []
         for frame in moves:

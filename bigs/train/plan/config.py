@@ -108,8 +108,10 @@ class MoveStage:
     weights: dict[str, float]
     step: StepKind = "single-subject"
     image_size: int = 160
-    # Frames are tried again if their outlines disagree by more than this many times as much as usual.
+    # Frames are tried again if their outlines disagree by more than this many times as much as usual, which
+    # is no less than outlines disagree that are a third of a pixel apart.
     worse: float = 2.0
+    exact: float = 0.01
     # Radians by which neighbours' poses are turned either way: fingers lie so far apart, seen from the wrist.
     turn: float = 0.25
     # Steps of every trial, and the steps that then follow for so many of each frame's best.

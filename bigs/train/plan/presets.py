@@ -199,8 +199,7 @@ _JOINT = OptimizeStage(
         "mse": 30.0,
         "alpha_outside": 4.0,
         "labels": 4.0,
-        # More than the rest: Gaussians of a hand may grow beyond it, its mesh cannot.
-        "silhouette": 12.0,
+        "silhouette": 4.0,
         **_PLAUSIBLE_TOGETHER,
     },
     image_size=240,
