@@ -13,7 +13,7 @@ from bigs.fused.arrays import array, shaped
 
 
 def covered_shares(points: Tensor, faces: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """The share [B, H, W] of each pixel that a mesh covers, counted at 64 places of the pixel.
+    """The share [B, H, W] of each pixel that a mesh covers, counted at 32 places of the pixel.
 
     Its gradient is that of the area itself: where what is covered ends at an edge, a shift of the edge by d
     along its outward normal adds d times its length. Triangles that reach behind the camera are not seen.
