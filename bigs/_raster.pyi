@@ -16,6 +16,8 @@ __all__ = [
     "__version__",
     "beyond_planes",
     "cone_distances",
+    "coverage_squares",
+    "coverage_squares_backward",
     "cut_patches",
     "default_settings",
     "distances",
@@ -204,6 +206,17 @@ def terms_together_backward(
     v: list[float],
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Flat gradients of colors and alphas from those of the terms."""
+
+def coverage_squares(arrays: tuple[NDArray[Any], ...], frames: tuple[int, ...]) -> list[float]:
+    """The squared distance [B] of each picture's coverage from what masks allow, summed over its pixels.
+
+    `arrays` are alphas [B, H, W], own and hidden [T, H, W].
+    """
+
+def coverage_squares_backward(
+    arrays: tuple[NDArray[Any], ...], frames: tuple[int, ...], v: list[float]
+) -> NDArray[Any]:
+    """The flat gradient of alphas from that of the pictures' sums."""
 
 def terms_alone(
     arrays: tuple[NDArray[Any] | None, ...], frames: tuple[int, ...]

@@ -75,6 +75,20 @@ def alone_terms(
     return AloneTerms(*_Alone.apply(tuple(frames.tolist()), alphas, colors, images, own, hidden))
 
 
+def coverage_squares(alphas: Tensor, own: Tensor, hidden: Tensor, frames: Tensor) -> Tensor:
+    """How far [B] a subject's coverage is from what its mask allows: squares, summed over each picture.
+
+    These are the sums that `amodal_silhouette` is a mean of.
+
+    Args:
+        alphas: [B, H, W] rendered.
+        own: [T, H, W] share of each pixel of the clip that shows the subject.
+        hidden: [T, H, W] share in which something may hide it.
+        frames: [B] of the T, which may repeat.
+    """
+    return _CoverageSquares.apply(tuple(frames.tolist()), alphas, own, hidden)
+
+
 class _Together(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -124,6 +138,21 @@ class _Alone(torch.autograd.Function):
             None,
             None,
         )
+
+
+class _CoverageSquares(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, frames: tuple[int, ...], alphas: Tensor, *masks: Tensor) -> Tensor:
+        ctx.arrays, ctx.frames = tuple(map(array, (alphas, *masks))), frames
+        ctx.save_for_backward(alphas)
+        return alphas.new_tensor(_raster.coverage_squares(ctx.arrays, frames))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, pull: Tensor) -> tuple:
+        (alphas,) = ctx.saved_tensors
+        found = _raster.coverage_squares_backward(ctx.arrays, ctx.frames, pull.tolist())
+        return None, shaped(found, alphas), None, None
 
 
 def _numbers(pulls: Sequence[Tensor | None]) -> list[float]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, together_terms
+from bigs.fused.pixels import AloneTerms, TogetherTerms, alone_terms, coverage_squares, together_terms
 from bigs.losses.mask import alpha_outside_masks, amodal_silhouette, label_difference
 from bigs.losses.photometric import masked_l1, masked_mse
 
@@ -92,6 +92,26 @@ def test_alone_is_the_losses() -> None:
     assert torch.equal(alone, whole)
 
 
+def test_coverage_of_each_picture_is_what_the_loss_sums() -> None:
+    _, _, unknown, shares = clip()
+    alphas = rendered(3)[1].detach()[..., 0].requires_grad_()
+    # Frames may repeat: several poses are tried in one.
+    frames = torch.tensor([3, 0, 3])
+    found = coverage_squares(alphas, shares[0], unknown, frames)
+    expected = torch.stack(
+        [
+            amodal_silhouette(alpha[None], shares[0][frame, None], unknown[frame, None])
+            * shares[0][frame].sum().clamp_min(1.0)
+            for alpha, frame in zip(alphas, frames, strict=True)
+        ]
+    )
+    check(found, expected, (alphas,))
+    single = coverage_squares(*(values.detach().float() for values in (alphas, shares[0], unknown)), frames)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), found.detach(), rtol=1e-6, atol=0)
+    assert len(coverage_squares(alphas[:0], shares[0], unknown, frames[:0])) == 0
+
+
 def test_gradients_are_finite_differences() -> None:
     images, foreground, unknown, shares = clip()
     colors, alphas = rendered(3 + E)
@@ -131,5 +151,11 @@ def test_what_does_not_fit_is_refused() -> None:
         alone_terms(colors, alphas, images, foreground, unknown, torch.tensor([0, 1, T]))
     with pytest.raises(ValueError, match="alphas: expected"):
         alone_terms(colors, alphas[:2], images, foreground, unknown, FRAMES)
+    with pytest.raises(ValueError, match="frames: expected indices"):
+        coverage_squares(alphas[..., 0], foreground, unknown, torch.tensor([0, 1, T]))
+    with pytest.raises(ValueError, match="alphas: expected"):
+        coverage_squares(alphas[:2, ..., 0], foreground, unknown, FRAMES)
+    with pytest.raises(ValueError, match="hidden: expected"):
+        coverage_squares(alphas[..., 0], foreground, unknown[:3], FRAMES)
     with pytest.raises(ValueError, match="unknown: expected"):
         together_terms(colors, alphas, images, foreground, unknown[:3], [], FRAMES, COVERED)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from bigs.fused.pixels import coverage_squares
 from bigs.guidance.denoiser import Denoiser
 from bigs.hand import bends, impossible_turns
 from bigs.losses.perceptual import VggWeights
@@ -107,9 +108,7 @@ class EvidenceSource:
 
         def ask(side: Side, poses: HandFrames, frames: Tensor) -> Tensor:
             alphas = step.covered(side, self.scene.hand_verts(side, poses))
-            own, hidden = targets.shares[side][frames], targets.hidden[side][frames]
-            nearest = alphas.detach().clamp(own, own + hidden)
-            squares = (alphas - nearest).square().sum((1, 2))
+            squares = coverage_squares(alphas, targets.shares[side], targets.hidden[side], frames)
             # A hand that hardly shows gives no reliable measure.
             area = areas[side].clamp_min(0.25 * areas[side].median())
             return torch.where(shown[frames], squares / area[frames], torch.nan)

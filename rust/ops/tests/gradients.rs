@@ -2,7 +2,7 @@
 
 use bigs_ops::fingers::{Costs, Fingers};
 use bigs_ops::joints::{Tree, rotations, rotations_vjp};
-use bigs_ops::pixels::{Frames, alone::Alone, together::Together};
+use bigs_ops::pixels::{Frames, alone, together::Together};
 
 const H: f64 = 1e-6;
 
@@ -92,14 +92,20 @@ fn pictures_of_one_subject() {
     let hidden: Vec<f64> = random(3, clip).iter().map(|v| 0.3 * v).collect();
     let (colors, alphas) = (random(6, 2 * PIXELS * 3), random(7, 2 * PIXELS));
     let weights = [0.7, 3.0, 1.3];
-    let with = |colors: Option<&[f64]>, alphas: &[f64]| {
-        let alone = Alone {
+    let masks = (&own[..], &hidden[..]);
+    fn covered<'a>(alphas: &'a [f64], (own, hidden): (&'a [f64], &'a [f64])) -> alone::Outline<'a, f64> {
+        alone::Outline {
             frames: frames(),
-            colors,
             alphas,
+            own,
+            hidden,
+        }
+    }
+    let with = |colors: Option<&[f64]>, alphas: &[f64]| {
+        let alone = alone::Alone {
+            outline: covered(alphas, masks),
+            colors,
             images: &images,
-            own: &own,
-            hidden: &hidden,
         };
         let terms = alone.terms().unwrap();
         (terms, alone.vjp(&terms, weights).unwrap())
@@ -115,24 +121,41 @@ fn pictures_of_one_subject() {
     let (outline, (none, v_outline)) = with(None, &alphas);
     assert_eq!(outline.values, [0.0, 0.0, terms.values[2]]);
     assert!(none.is_empty() && v_outline == v_alphas);
+
+    // The same picture by picture.
+    let each = covered(&alphas, masks).squares().unwrap();
+    let area = terms.own;
+    assert!((each.iter().sum::<f64>() / area - terms.values[2]).abs() < 1e-12 * terms.values[2]);
+    let pulls = covered(&alphas, masks).squares_vjp(&[2.0, -0.5]).unwrap();
+    check("coverage", &pulls, &|i, h| {
+        dot(
+            &covered(&changed(&alphas, i, h), masks).squares().unwrap(),
+            &[2.0, -0.5],
+        )
+    });
+    assert!(covered(&alphas, masks).squares_vjp(&[1.0]).is_err());
 }
 
 #[test]
 fn frames_that_the_clip_does_not_have_are_refused() {
     let values = vec![0f32; 2 * PIXELS];
-    let alone = Alone {
+    let outline = alone::Outline {
         frames: Frames {
             frames: &[0, 2],
             pixels: PIXELS,
             clip: 2,
         },
-        colors: None,
         alphas: &values,
-        images: &[],
         own: &values,
         hidden: &values,
     };
+    let alone = alone::Alone {
+        outline,
+        colors: None,
+        images: &[],
+    };
     assert!(alone.terms().unwrap_err().to_string().starts_with("frames"));
+    assert!(outline.squares().unwrap_err().to_string().starts_with("frames"));
 }
 
 #[test]

@@ -344,6 +344,8 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(touch::touch_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_together_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::coverage_squares, m)?)?;
+    m.add_function(wrap_pyfunction!(pixels::coverage_squares_backward, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone, m)?)?;
     m.add_function(wrap_pyfunction!(pixels::terms_alone_backward, m)?)?;
     m.add_function(wrap_pyfunction!(track::cut_patches, m)?)?;

@@ -141,16 +141,78 @@ pub(crate) fn terms_together_backward<'py>(
     }
 }
 
+const OUTLINE: [&str; 3] = ["alphas", "own", "hidden"];
+
+fn outline<'a, T: Kind>(held: &'a Held<'_, T>, frames: &'a [usize]) -> PyResult<alone::Outline<'a, T>> {
+    Ok(alone::Outline {
+        frames: held.frames(frames, 1),
+        alphas: held.get(0)?,
+        own: held.get(1)?,
+        hidden: held.get(2)?,
+    })
+}
+
+/// The squared distance `[B]` of each picture's coverage from what masks allow, summed over its pixels: see
+/// `bigs.fused.pixels`.
+///
+/// `arrays` is (alphas `[B, H, W]`, own and hidden `[T, H, W]`), C-contiguous, float32 or float64 throughout; `frames` names B
+/// of the T. Raises ValueError.
+#[pyfunction]
+pub(crate) fn coverage_squares(
+    py: Python<'_>,
+    arrays: &Bound<'_, PyTuple>,
+    frames: Vec<usize>,
+) -> PyResult<Vec<f64>> {
+    fn of<T: Kind>(py: Python<'_>, arrays: &Bound<'_, PyTuple>, frames: &[usize]) -> PyResult<Vec<f64>> {
+        let held = Held::<T>::extract(&OUTLINE, arrays)?;
+        let outline = outline(&held, frames)?;
+        run(py, || outline.squares())
+    }
+    if is_single(arrays) {
+        of::<f32>(py, arrays, &frames)
+    } else {
+        of::<f64>(py, arrays, &frames)
+    }
+}
+
+/// The flat gradient of alphas from that of the pictures' sums. Takes the arguments of the forward call.
+#[pyfunction]
+pub(crate) fn coverage_squares_backward<'py>(
+    py: Python<'py>,
+    arrays: &Bound<'py, PyTuple>,
+    frames: Vec<usize>,
+    v: Vec<f64>,
+) -> PyResult<Bound<'py, PyAny>> {
+    fn of<'py, T: Kind>(
+        py: Python<'py>,
+        arrays: &Bound<'py, PyTuple>,
+        frames: &[usize],
+        v: &[f64],
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let held = Held::<T>::extract(&OUTLINE, arrays)?;
+        let outline = outline(&held, frames)?;
+        let pulls = run(py, || outline.squares_vjp(v))?;
+        Ok(gradient(py, pulls).into_any())
+    }
+    if is_single(arrays) {
+        of::<f32>(py, arrays, &frames, &v)
+    } else {
+        of::<f64>(py, arrays, &frames, &v)
+    }
+}
+
 const ALONE: [&str; 5] = ["alphas", "colors", "images", "own", "hidden"];
 
 fn one_alone<'a, T: Kind>(held: &'a Held<'_, T>, frames: &'a [usize]) -> PyResult<alone::Alone<'a, T>> {
     Ok(alone::Alone {
-        frames: held.frames(frames, 3),
-        alphas: held.get(0)?,
+        outline: alone::Outline {
+            frames: held.frames(frames, 3),
+            alphas: held.get(0)?,
+            own: held.get(3)?,
+            hidden: held.get(4)?,
+        },
         colors: held.maybe(1)?,
         images: held.get(2)?,
-        own: held.get(3)?,
-        hidden: held.get(4)?,
     })
 }
 

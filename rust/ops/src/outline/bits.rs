@@ -13,6 +13,14 @@ const PIXELS_IN_WORD: usize = u64::BITS as usize / ACROSS;
 /// A place among the samples, which are at whole numbers: across, down.
 pub(super) type Point = [f64; 2];
 
+/// A sample of a row at which so many triangles more begin than end.
+#[derive(Clone, Copy)]
+pub(super) struct Crossing {
+    row: usize,
+    column: usize,
+    net: i32,
+}
+
 /// Where a frame's samples are covered: words along each row of samples, the first pixel in the lowest byte.
 #[derive(Clone, Debug)]
 pub(super) struct Bits {
@@ -33,24 +41,34 @@ impl Bits {
         })
     }
 
-    /// Marks the samples inside a triangle.
-    pub(super) fn fill(&mut self, mut corners: [Point; 3]) {
-        corners.sort_unstable_by(|a, b| a[1].total_cmp(&b[1]));
-        let [top, middle, bottom] = corners;
-        let long = Side::new(top, bottom);
-        for (from, to) in [(top, middle), (middle, bottom)] {
-            self.fill_between(&long, &Side::new(from, to), [from[1], to[1]]);
+    /// Marks the samples that lie in a triangle: those to the left of which more triangles begin than end.
+    pub(super) fn fill(&mut self, mut crossings: Vec<Crossing>) {
+        crossings.sort_unstable_by_key(|crossing| (crossing.row, crossing.column));
+        let mut deep = 0;
+        for pair in crossings.windows(2) {
+            deep += pair[0].net;
+            // Whatever begins in a row ends there.
+            if deep != 0 {
+                self.mark(pair[0].row, pair[0].column, pair[1].column);
+            }
         }
     }
 
-    /// Marks the samples between two sides, in rows from the first number to before the second one.
-    fn fill_between(&mut self, a: &Side, b: &Side, rows: [f64; 2]) {
-        let [first, end] = rows.map(|row| ceil_within(row, (self.size[1] * DOWN) as f64));
-        let most = (self.size[0] * ACROSS) as f64;
-        for row in first..end {
-            let (one, other) = (a.at(row as f64), b.at(row as f64));
-            let [from, to] = [one.min(other), one.max(other)].map(|x| ceil_within(x, most));
-            self.mark(row, from, to);
+    /// Where an edge crosses the rows of samples, where so many triangles more begin than end at it, `net`, as one walks
+    /// down from `a` to `b`.
+    pub(super) fn cross(&self, [a, b]: [Point; 2], net: i32, crossings: &mut Vec<Crossing>) {
+        // From its upper end to its lower one.
+        let ([top, bottom], net) = if a[1] < b[1] {
+            ([a, b], net)
+        } else {
+            ([b, a], -net)
+        };
+        let slope = (bottom[0] - top[0]) / (bottom[1] - top[1]);
+        let [width, height] = [self.size[0] * ACROSS, self.size[1] * DOWN].map(|size| size as f64);
+        for row in ceil_within(top[1], height)..ceil_within(bottom[1], height) {
+            let x = top[0] + (row as f64 - top[1]) * slope;
+            let column = ceil_within(x, width);
+            crossings.push(Crossing { row, column, net });
         }
     }
 
@@ -73,7 +91,7 @@ impl Bits {
         }
     }
 
-    /// The covered share of each pixel, H × W.
+    /// The covered share of each pixel, H × W; those that are not covered at all are left as they are.
     pub(super) fn shares<T: Real>(&self, out: &mut [T]) {
         let part = 1.0 / (DOWN * ACROSS) as f64;
         let [width, _] = self.size;
@@ -83,14 +101,12 @@ impl Bits {
             .zip(out.chunks_exact_mut(width))
         {
             for (word, out) in out.chunks_mut(PIXELS_IN_WORD).enumerate() {
-                let mut counts = [0_u32; PIXELS_IN_WORD];
-                for row in 0..DOWN {
-                    let bytes = rows[row * self.stride + word].to_le_bytes();
-                    for (count, byte) in counts.iter_mut().zip(bytes) {
-                        *count += byte.count_ones();
-                    }
+                let of_row = |row: usize| rows[row * self.stride + word];
+                if (0..DOWN).all(|row| of_row(row) == 0) {
+                    continue;
                 }
-                for (out, &count) in out.iter_mut().zip(&counts) {
+                let counts: u64 = (0..DOWN).map(|row| ones_in_bytes(of_row(row))).sum();
+                for (out, count) in out.iter_mut().zip(counts.to_le_bytes()) {
                     *out = T::of(f64::from(count) * part);
                 }
             }
@@ -116,22 +132,10 @@ pub(super) fn ceil_within(x: f64, most: f64) -> usize {
     (whole + u32::from(f64::from(whole) < x)) as usize
 }
 
-/// The line along a side of a triangle.
-struct Side {
-    start: Point,
-    slope: f64,
-}
-
-impl Side {
-    /// From its upper end to its lower one: both triangles at a side see the same line, and no sample is lost between them.
-    fn new(a: Point, b: Point) -> Self {
-        Self {
-            start: a,
-            slope: (b[0] - a[0]) / (b[1] - a[1]),
-        }
-    }
-
-    fn at(&self, y: f64) -> f64 {
-        self.start[0] + (y - self.start[1]) * self.slope
-    }
+/// How many bits are set in each byte of a word; eight counts at once, where `u64::count_ones` may be no instruction.
+fn ones_in_bytes(word: u64) -> u64 {
+    const EVERY_BYTE: u64 = u64::MAX / 0xff;
+    let pairs = word - ((word >> 1) & (0x55 * EVERY_BYTE));
+    let fours = (pairs & (0x33 * EVERY_BYTE)) + ((pairs >> 2) & (0x33 * EVERY_BYTE));
+    (fours + (fours >> 4)) & (0x0f * EVERY_BYTE)
 }

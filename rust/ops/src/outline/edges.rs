@@ -1,130 +1,122 @@
-//! The edges at which what a mesh covers ends, and how they move it.
+//! The edges of triangles, and which way each triangle faces.
 
-use bigs_raster::Real;
+use crate::OpsError;
+use bigs_raster::filled_with;
 
-use super::bits::{Bits, Point, SAMPLES, ceil_within};
+use super::bits::Point;
 
-/// A place among samples that no picture reaches.
-const FAR_OUTSIDE: f64 = 1e9;
-
-/// An edge, and the vertices that make triangles with it.
-pub(super) struct Edge {
-    ends: [usize; 2],
-    across: Vec<usize>,
+/// Edges in the order of their vertices, each with the triangles at it.
+pub(super) struct Edges {
+    each: Vec<Edge>,
+    triangles: Vec<Neighbour>,
 }
 
-/// The edges of triangles, in an order of their own.
-pub(super) fn edges(faces: &[[usize; 3]]) -> Vec<Edge> {
-    let mut all: Vec<([usize; 2], usize)> = faces
-        .iter()
-        .flat_map(|&[a, b, c]| {
-            [
-                ([a.min(b), a.max(b)], c),
-                ([b.min(c), b.max(c)], a),
-                ([c.min(a), c.max(a)], b),
-            ]
+/// An edge's vertices, the lower index first, and where its triangles end in the list.
+struct Edge {
+    ends: [usize; 2],
+    until: usize,
+}
+
+/// A triangle at an edge.
+#[derive(Clone, Copy)]
+struct Neighbour {
+    face: usize,
+    /// 1 if the triangle passes the edge from its first vertex to its second one, otherwise -1.
+    way: i32,
+}
+
+/// The triangles at an edge, in a frame.
+pub(super) struct Beside {
+    /// How many triangles begin on the right of the edge as one walks down the picture along it from its first vertex,
+    /// less those that end there.
+    pub(super) net: i32,
+    /// The side of it on which all triangles lie: 1 if to the right in that sense, -1 if to the left. None if they lie on
+    /// both sides, and where a triangle is not seen.
+    pub(super) side: Option<i32>,
+}
+
+impl Edges {
+    /// The edges of triangles between `vertices` vertices.
+    ///
+    /// # Errors
+    /// No memory.
+    pub(super) fn of(faces: &[[usize; 3]], vertices: usize) -> Result<Self, OpsError> {
+        // By their first vertices, of which each has few: much less work than to sort them all.
+        let mut ends_at = filled_with("edges", 0, &[vertices + 1])?;
+        for_each_side(faces, |[first, _], _| ends_at[first + 1] += 1);
+        for vertex in 0..vertices {
+            ends_at[vertex + 1] += ends_at[vertex];
+        }
+        let mut next = ends_at.clone();
+        let mut sorted = filled_with("edges", (0, Neighbour { face: 0, way: 0 }), &[faces.len(), 3])?;
+        for_each_side(faces, |[first, second], neighbour| {
+            sorted[next[first]] = (second, neighbour);
+            next[first] += 1;
+        });
+        let mut each = Vec::with_capacity(sorted.len() / 2);
+        for first in 0..vertices {
+            let begin = ends_at[first];
+            let of_vertex = &mut sorted[begin..ends_at[first + 1]];
+            of_vertex.sort_by_key(|&(second, _)| second);
+            let mut until = begin;
+            for of_edge in of_vertex.chunk_by(|one, other| one.0 == other.0) {
+                until += of_edge.len();
+                each.push(Edge {
+                    ends: [first, of_edge[0].0],
+                    until,
+                });
+            }
+        }
+        Ok(Self {
+            each,
+            triangles: sorted.into_iter().map(|(_, neighbour)| neighbour).collect(),
         })
-        .collect();
-    all.sort_unstable();
-    all.chunk_by(|one, other| one.0 == other.0)
-        .map(|of_edge| Edge {
-            ends: of_edge[0].0,
-            across: of_edge.iter().map(|&(_, across)| across).collect(),
+    }
+
+    /// Each edge's ends, and what is beside it, by the triangles' `facings`.
+    pub(super) fn beside<'a>(
+        &'a self,
+        facings: &'a [Option<i32>],
+    ) -> impl Iterator<Item = ([usize; 2], Beside)> + 'a {
+        let mut begin = 0;
+        self.each.iter().map(move |edge| {
+            let triangles = &self.triangles[begin..edge.until];
+            begin = edge.until;
+            let (mut net, mut left, mut right, mut all_seen) = (0, false, false, true);
+            for neighbour in triangles {
+                let side = facings[neighbour.face].map(|facing| facing * neighbour.way);
+                all_seen &= side.is_some();
+                let side = side.unwrap_or(0);
+                net += side;
+                left |= side < 0;
+                right |= side > 0;
+            }
+            let side = (all_seen && left != right).then_some(if right { 1 } else { -1 });
+            (edge.ends, Beside { net, side })
+        })
+    }
+}
+
+/// Calls `visit` with every side of every triangle: its vertices, the lower index first, and the triangle.
+fn for_each_side(faces: &[[usize; 3]], mut visit: impl FnMut([usize; 2], Neighbour)) {
+    for (face, &[a, b, c]) in faces.iter().enumerate() {
+        for [from, to] in [[a, b], [b, c], [c, a]] {
+            let way = if from < to { 1 } else { -1 };
+            visit([from.min(to), from.max(to)], Neighbour { face, way });
+        }
+    }
+}
+
+/// Which way each triangle faces: 1, -1, or 0 if it is seen from its edge; none if it is not seen. Its sides then agree
+/// on where it lies whatever is rounded.
+pub(super) fn facings(faces: &[[usize; 3]], seen: &[Option<Point>]) -> Vec<Option<i32>> {
+    faces
+        .iter()
+        .map(|face| {
+            let [a, b, c] = face.map(|vertex| seen[vertex]);
+            let (a, b, c) = (a?, b?, c?);
+            let turn = (b[1] - a[1]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[1] - a[1]);
+            Some(i32::from(turn > 0.0) - i32::from(turn < 0.0))
         })
         .collect()
-}
-
-/// One frame's outline, along which the gradient of the shares pulls at vertices.
-pub(super) struct Outline<'a, T> {
-    bits: &'a Bits,
-    v: &'a [T],
-    /// Of each direction, up, down, left and right, the uncovered samples that an edge already ends at. Several edges may
-    /// lie nearer to each other than samples do, of which one moves what is covered.
-    taken: [Vec<u64>; 4],
-    /// V, in samples.
-    pub(super) pulls: Vec<Point>,
-}
-
-impl<'a, T: Real> Outline<'a, T> {
-    pub(super) fn new(bits: &'a Bits, v: &'a [T], vertices: usize) -> Self {
-        Self {
-            bits,
-            v,
-            taken: std::array::from_fn(|_| vec![0; bits.words.len()]),
-            pulls: vec![[0.0; 2]; vertices],
-        }
-    }
-
-    /// Adds what an edge does between vertices that are seen, in samples.
-    pub(super) fn add(&mut self, edge: &Edge, seen: &[Option<Point>]) {
-        let [Some(a), Some(b)] = edge.ends.map(|end| seen[end]) else {
-            return;
-        };
-        let along = [b[0] - a[0], b[1] - a[1]];
-        // What is covered ends here only where all triangles lie on one side.
-        let (mut left, mut right) = (false, false);
-        for &corner in &edge.across {
-            let Some(c) = seen[corner] else { return };
-            let turn = along[0] * (c[1] - a[1]) - along[1] * (c[0] - a[0]);
-            left |= turn > 0.0;
-            right |= turn < 0.0;
-        }
-        if left == right {
-            return;
-        }
-        let normal = if left {
-            [along[1], -along[0]]
-        } else {
-            [-along[1], along[0]]
-        };
-        // The axis along which the edge crosses more lines of samples, and the other one, along which it ends them.
-        let main = usize::from(along[1].abs() * SAMPLES[0] as f64 > along[0].abs() * SAMPLES[1] as f64);
-        let other = 1 - main;
-        let onwards = normal[other] > 0.0;
-        let slope = along[other] / along[main];
-        let most = (self.bits.size[main] * SAMPLES[main]) as f64;
-        let (low, high) = (a[main].min(b[main]), a[main].max(b[main]));
-        for line in ceil_within(low, most)..ceil_within(high, most) {
-            let share = (line as f64 - a[main]) / along[main];
-            let end = a[other] + share * along[other];
-            if let Some(v) = self.take(main, line, end, onwards) {
-                let force = if onwards { v } else { -v };
-                for (vertex, part) in edge.ends.into_iter().zip([1.0 - share, share]) {
-                    self.pulls[vertex][other] += part * force;
-                    self.pulls[vertex][main] -= part * force * slope;
-                }
-            }
-        }
-    }
-
-    /// The gradient of the share of the pixel in which a line of samples ends; none where something goes on, where another
-    /// edge ends the line, or outside the picture.
-    fn take(&mut self, main: usize, line: usize, end: f64, onwards: bool) -> Option<f64> {
-        let other = 1 - main;
-        let first_outside = end.clamp(-1.0, FAR_OUTSIDE).ceil() as i64 - i64::from(!onwards);
-        let sample = if main == 0 {
-            [line as i64, first_outside]
-        } else {
-            [first_outside, line as i64]
-        };
-        if let Some((word, bit)) = self.bits.place(sample) {
-            let taken = &mut self.taken[2 * main + usize::from(onwards)][word];
-            if (self.bits.words[word] | *taken) & bit != 0 {
-                return None;
-            }
-            *taken |= bit;
-        }
-        // Of the samples on both sides of the end, in whose pixel is it?
-        let at = (end + 0.5) / SAMPLES[other] as f64;
-        if at < 0.0 || at >= self.bits.size[other] as f64 {
-            return None;
-        }
-        let (of_line, of_end) = (line / SAMPLES[main], at as usize);
-        let [x, y] = if main == 0 {
-            [of_line, of_end]
-        } else {
-            [of_end, of_line]
-        };
-        Some(self.v[y * self.bits.size[0] + x].as_f64())
-    }
 }

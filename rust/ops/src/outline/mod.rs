@@ -5,6 +5,7 @@
 
 mod bits;
 mod edges;
+mod pulls;
 
 use bigs_raster::{Real, filled_with};
 use rayon::prelude::*;
@@ -12,7 +13,8 @@ use rayon::prelude::*;
 use crate::OpsError;
 use crate::checks::check_length;
 use bits::{Bits, Point, SAMPLES};
-use edges::{Outline, edges};
+use edges::{Edges, facings};
+use pulls::{Outline, Taken};
 
 /// What is nearer to the camera's plane than this is not seen, in the points' unit.
 const NEAREST: f64 = 1e-3;
@@ -59,13 +61,18 @@ impl<T: Real> Mesh<'_, T> {
         let mut frames = (0..self.frames)
             .map(|_| Bits::empty(self.size))
             .collect::<Result<Vec<_>, _>>()?;
+        let edges = Edges::of(self.faces, each)?;
         frames.par_iter_mut().enumerate().for_each(|(frame, bits)| {
             let seen = self.seen(frame, each);
-            for face in self.faces {
-                if let [Some(a), Some(b), Some(c)] = face.map(|vertex| seen[vertex]) {
-                    bits.fill([a, b, c]);
+            let mut crossings = Vec::new();
+            for (ends, beside) in edges.beside(&facings(self.faces, &seen)) {
+                if beside.net != 0
+                    && let [Some(a), Some(b)] = ends.map(|end| seen[end])
+                {
+                    bits.cross([a, b], beside.net, &mut crossings);
                 }
             }
+            bits.fill(crossings);
         });
         Ok(Covered { frames })
     }
@@ -91,7 +98,7 @@ impl<T: Real> Mesh<'_, T> {
         if each == 0 || pixels == 0 {
             return Ok(out);
         }
-        let edges = edges(self.faces);
+        let edges = Edges::of(self.faces, each)?;
         (
             out.par_chunks_exact_mut(each),
             &covered.frames,
@@ -99,11 +106,15 @@ impl<T: Real> Mesh<'_, T> {
         )
             .into_par_iter()
             .enumerate()
-            .for_each(|(frame, (out, bits, v))| {
+            .for_each_init(Taken::default, |taken, (frame, (out, bits, v))| {
                 let seen = self.seen(frame, each);
-                let mut outline = Outline::new(bits, v, each);
-                for edge in &edges {
-                    outline.add(edge, &seen);
+                let mut outline = Outline::new(bits, v, each, taken);
+                for (ends, beside) in edges.beside(&facings(self.faces, &seen)) {
+                    if let Some(side) = beside.side
+                        && let [Some(a), Some(b)] = ends.map(|end| seen[end])
+                    {
+                        outline.add(ends, [a, b], side);
+                    }
                 }
                 let points = &self.points[frame * each..][..each];
                 for ((out, pull), point) in out.iter_mut().zip(&outline.pulls).zip(points) {
