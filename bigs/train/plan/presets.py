@@ -316,7 +316,8 @@ FULL = replace(
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=50),
         _MOVES,
-        replace(_REGRASP, steps=90),
+        # Every step brings outlines nearer, and poses with them, long after the loss looks settled.
+        replace(_REGRASP, steps=160, stop_patience=0),
         _FREED,
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
         RefineStage(image_size=640),

@@ -22,7 +22,7 @@ struct Edge {
 struct Neighbour {
     face: usize,
     /// 1 if the triangle passes the edge from its first vertex to its second one, otherwise -1.
-    way: i32,
+    way: i8,
 }
 
 /// The triangles at an edge, in a frame.
@@ -30,9 +30,8 @@ pub(super) struct Beside {
     /// How many triangles begin on the right of the edge as one walks down the picture along it from its first vertex,
     /// less those that end there.
     pub(super) net: i32,
-    /// The side of it on which all triangles lie: 1 if to the right in that sense, -1 if to the left. None if they lie on
-    /// both sides, and where a triangle is not seen.
-    pub(super) side: Option<i32>,
+    /// The side of it on which all triangles lie: 1 if to the right in that sense, -1 if to the left, 0 if they lie on both.
+    pub(super) side: i32,
 }
 
 impl Edges {
@@ -74,24 +73,18 @@ impl Edges {
     }
 
     /// Each edge's ends, and what is beside it, by the triangles' `facings`.
-    pub(super) fn beside<'a>(
-        &'a self,
-        facings: &'a [Option<i32>],
-    ) -> impl Iterator<Item = ([usize; 2], Beside)> + 'a {
+    pub(super) fn beside<'a>(&'a self, facings: &'a [i8]) -> impl Iterator<Item = ([usize; 2], Beside)> + 'a {
         let mut begin = 0;
         self.each.iter().map(move |edge| {
             let triangles = &self.triangles[begin..edge.until];
             begin = edge.until;
-            let (mut net, mut left, mut right, mut all_seen) = (0, false, false, true);
+            let (mut net, mut all) = (0, 0);
             for neighbour in triangles {
-                let side = facings[neighbour.face].map(|facing| facing * neighbour.way);
-                all_seen &= side.is_some();
-                let side = side.unwrap_or(0);
+                let side = i32::from(facings[neighbour.face] * neighbour.way);
                 net += side;
-                left |= side < 0;
-                right |= side > 0;
+                all += side.abs();
             }
-            let side = (all_seen && left != right).then_some(if right { 1 } else { -1 });
+            let side = if net.abs() == all { net.signum() } else { 0 };
             (edge.ends, Beside { net, side })
         })
     }
@@ -107,16 +100,17 @@ fn for_each_side(faces: &[[usize; 3]], mut visit: impl FnMut([usize; 2], Neighbo
     }
 }
 
-/// Which way each triangle faces: 1, -1, or 0 if it is seen from its edge; none if it is not seen. Its sides then agree
-/// on where it lies whatever is rounded.
-pub(super) fn facings(faces: &[[usize; 3]], seen: &[Option<Point>]) -> Vec<Option<i32>> {
+/// Which way each triangle faces: 1 or -1, and 0 if it is seen from its edge or not at all. Its sides then agree on where it
+/// lies whatever is rounded.
+pub(super) fn facings(faces: &[[usize; 3]], seen: &[Option<Point>]) -> Vec<i8> {
     faces
         .iter()
         .map(|face| {
-            let [a, b, c] = face.map(|vertex| seen[vertex]);
-            let (a, b, c) = (a?, b?, c?);
+            let [Some(a), Some(b), Some(c)] = face.map(|vertex| seen[vertex]) else {
+                return 0;
+            };
             let turn = (b[1] - a[1]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[1] - a[1]);
-            Some(i32::from(turn > 0.0) - i32::from(turn < 0.0))
+            i8::from(turn > 0.0) - i8::from(turn < 0.0)
         })
         .collect()
 }

@@ -110,10 +110,10 @@ impl<T: Real> Mesh<'_, T> {
                 let seen = self.seen(frame, each);
                 let mut outline = Outline::new(bits, v, each, taken);
                 for (ends, beside) in edges.beside(&facings(self.faces, &seen)) {
-                    if let Some(side) = beside.side
+                    if beside.side != 0
                         && let [Some(a), Some(b)] = ends.map(|end| seen[end])
                     {
-                        outline.add(ends, [a, b], side);
+                        outline.add(ends, [a, b], beside.side);
                     }
                 }
                 let points = &self.points[frame * each..][..each];
