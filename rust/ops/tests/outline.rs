@@ -65,6 +65,42 @@ fn winding_and_the_cut_into_triangles_do_not_matter() {
 }
 
 #[test]
+fn a_heap_of_triangles_covers_what_each_of_them_covers() {
+    let mut random = fastrand::Rng::with_seed(7);
+    // Few vertices: edges have many triangles, some of which use a vertex twice. Some places are outside the picture.
+    let places: Vec<[f64; 2]> = (0..9)
+        .map(|_| [60.0 * random.f64() - 10.0, 50.0 * random.f64() - 10.0])
+        .collect();
+    for count in [1, 2, 5, 20] {
+        let faces: Vec<[usize; 3]> = (0..count)
+            .map(|_| [0, 1, 2].map(|_| random.usize(0..9)))
+            .collect();
+        let inside = |x: f64, y: f64| {
+            faces.iter().any(|face| {
+                let [a, b, c] = face.map(|vertex| places[vertex]);
+                let turn = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]);
+                let turns = [turn(a, b), turn(b, c), turn(c, a)];
+                turns.iter().all(|&t| t > 0.0) || turns.iter().all(|&t| t < 0.0)
+            })
+        };
+        let points = at(&places);
+        let shares = mesh(&points, &faces).cover().unwrap().shares::<f64>().unwrap();
+        for (pixel, share) in shares.into_iter().enumerate() {
+            let samples = (0..32).filter(|sample| {
+                let x = (pixel % WIDTH) as f64 + (f64::from(sample % 8) + 0.5) / 8.0;
+                let y = (pixel / WIDTH) as f64 + (f64::from(sample / 8) + 0.5) / 4.0;
+                inside(x, y)
+            });
+            assert_eq!(
+                share,
+                samples.count() as f64 / 32.0,
+                "{count} triangles, pixel {pixel}"
+            );
+        }
+    }
+}
+
+#[test]
 fn edges_that_lie_on_each_other_count_once() {
     let triangle = [[5.0, 5.0], [35.0, 6.0], [12.0, 25.0]];
     let twice = at(&[triangle, triangle].concat());
