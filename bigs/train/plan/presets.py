@@ -105,8 +105,8 @@ _CONTACT = OptimizeStage(
     image_size=160,
     stop_patience=_SETTLED,
 )
-# The hand's shape and skinning are the template's, the object's shape is that of its start: colours of so few
-# steps say nothing better about them.
+# The hand's shape and skinning are the template's: colours of so few steps say nothing better about them. The
+# object's shape is learned from here on, since poor masks leave it a start that is centimetres off.
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
@@ -117,11 +117,12 @@ _APPEARANCE = OptimizeStage(
         "hand.color": 1e-2,
         "object.triplane": 1e-2,
         "object.appearance": 2e-3,
+        "object.geometry": 5e-4,
         "scene.light": 1e-2,
         "scene.shade": 1e-2,
         "scene.ambient": 1e-2,
     },
-    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02},
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
     image_size=240,
     frames_per_step=6,
 )
