@@ -106,7 +106,7 @@ _CONTACT = OptimizeStage(
     stop_patience=_SETTLED,
 )
 # The hand's shape and skinning are the template's: colours of so few steps say nothing better about them. The
-# object's shape is learned from here on, since poor masks leave it a start that is centimetres off.
+# object's shape is learned from here on, since poor masks leave it a wrong start.
 _APPEARANCE = OptimizeStage(
     name="appearance",
     step="single-subject",
