@@ -14,7 +14,7 @@ from bigs.types import Side
 
 
 def silhouette(step: Step) -> Tensor:
-    """Every hand alone against its own mask, by a few opaque Gaussians on its vertices."""
+    """Every hand alone against its own mask, by what its mesh covers."""
     return mean_of(step.silhouette(side) for side in step.scene.sides if len(step.frames_of(side)))
 
 
