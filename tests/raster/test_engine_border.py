@@ -159,6 +159,30 @@ def test_a_forked_process_is_told_and_does_not_wait() -> None:
     )
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
+@pytest.mark.parametrize("first", ["main", "other"])
+def test_the_main_thread_works_itself_and_others_share_a_pool(first: str) -> None:
+    """Of three workers for the main thread it is one; threads that come and go are none."""
+    ask = (
+        "import os, sys, threading, numpy as np, bigs._raster as r\n"
+        "def call(): r.harmonics_forward(0, (np.ones((1, 3)), np.ones((1, 1, 3)), None))\n"
+        "def elsewhere():\n"
+        "    other = threading.Thread(target=call)\n"
+        "    other.start()\n"
+        "    other.join()\n"
+        "count = lambda: len(os.listdir('/proc/self/task'))\n"
+        "before = count()\n"
+        f"for work in {'(call, call, elsewhere)' if first == 'main' else '(elsewhere, elsewhere, call)'}:\n"
+        "    work()\n"
+        "    print(count() - before)\n"
+    )
+    env = {**os.environ, "RAYON_NUM_THREADS": "3"}
+    told = subprocess.run(
+        [sys.executable, "-c", ask], env=env, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert told.stdout.split() == (["2", "2", "5"] if first == "main" else ["3", "3", "5"])
+
+
 def test_threads_share_the_engine() -> None:
     inputs = arrays(200)
     weights = np.random.default_rng(2).normal(size=(16, 16, 3)).astype(np.float32)
