@@ -15,6 +15,7 @@ from bigs.cli.terminal import (
     Preset,
     RunPath,
     fail_for,
+    importing,
     print_table,
     print_tables,
     say,
@@ -75,9 +76,10 @@ def demo(out: Path = Path("demo_run"), preset: Preset = "demo", threads: int = 0
         threads: CPU threads; 0 uses all cores.
         seed: random seed of the clip and of the reconstruction.
     """
-    use_threads(threads)
-    from bigs.commands.progress import progress_listener
-    from bigs.commands.run.demo import demo as run_demo
+    with importing():
+        use_threads(threads)
+        from bigs.commands.progress import progress_listener
+        from bigs.commands.run.demo import demo as run_demo
 
     config = settings_of(preset, None, (f"seed={seed}",))
     with progress_listener(stderr, config) as listen:
@@ -148,11 +150,12 @@ def reconstruct(
         threads: CPU threads; 0 uses all cores.
         video: options of preprocessing, if the clip is a video or a folder of images.
     """
-    use_threads(threads)
-    from bigs.commands.prior.weights import with_prior
-    from bigs.commands.progress import progress_listener
-    from bigs.commands.run.reconstruct import reconstruct as run
-    from bigs.train.switches import without_all
+    with importing():
+        use_threads(threads)
+        from bigs.commands.prior.weights import with_prior
+        from bigs.commands.progress import progress_listener
+        from bigs.commands.run.reconstruct import reconstruct as run
+        from bigs.train.switches import without_all
 
     settings, unused = without_all(settings_of(preset, config, set), without)
     if perceptual_weights:
@@ -216,8 +219,9 @@ def render(
         background: white, black, R,G,B (each 0 to 255) or transparent, which is black in a video.
         threads: CPU threads; 0 uses all cores.
     """
-    use_threads(threads)
-    from bigs.commands.render.views import Shot, Wanted, background_of, render_run
+    with importing():
+        use_threads(threads)
+        from bigs.commands.render.views import Shot, Wanted, background_of, render_run
 
     shot = Shot(cameras, orbit, from_input, frame, play, about, pictures, size, world)
     wanted = Wanted(out, video, depth, background_of(background))

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from bigs.checks import InputError
-from bigs.cli.terminal import print_table, print_tables, say, telling, use_threads
+from bigs.cli.terminal import importing, print_table, print_tables, say, telling, use_threads
 
 
 def evaluate(
@@ -38,9 +38,10 @@ def evaluate(
         all: show every score of a run, not only the first five; scores.csv has them too.
         threads: CPU threads; 0 uses all cores.
     """
-    use_threads(threads)
-    from bigs.commands.evaluate.paper_tables import beside_paper
-    from bigs.commands.evaluate.runs import EvaluationPlan, compare_runs, evaluate_run, run_names
+    with importing():
+        use_threads(threads)
+        from bigs.commands.evaluate.paper_tables import beside_paper
+        from bigs.commands.evaluate.runs import EvaluationPlan, compare_runs, evaluate_run, run_names
 
     if not runs:
         raise InputError("bigs eval: expected a run folder, found none")

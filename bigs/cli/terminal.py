@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import os
 import sys
@@ -118,6 +119,25 @@ def use_threads(threads: int) -> None:
         from bigs.threads import limit_threads
 
         limit_threads(threads)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Imports of the block, which load torch, without the search for objects that only refer to each other.
+
+    The modules are half a million objects that stay: the search would go through them again and again while
+    they load, and once more whenever the command's own objects have grown by a quarter of them. Where torch
+    is loaded already the block is an ordinary one.
+    """
+    if "torch" in sys.modules:
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def settings_of(
