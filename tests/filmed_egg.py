@@ -25,11 +25,12 @@ def picture(rotation: np.ndarray, transl: np.ndarray, light: float) -> tuple[np.
     a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1.0
     root = b**2 - a * c
     on = root > 0
-    depth = (-b - np.sqrt(root.clip(0.0))) / a
-    place = (eye + depth[..., None] * ray) * AXES
+    depth = (-b[on] - np.sqrt(root[on])) / a[on]
+    place = (eye + depth[:, None] * ray[on]) * AXES
     rng = np.random.default_rng(4)
     waves = rng.standard_normal((40, 3))
     waves *= (2.0 * np.pi / rng.uniform(0.007, 0.03, 40) / np.linalg.norm(waves, axis=1))[:, None]
     texture = np.sin(place @ waves.T + rng.uniform(0.0, 6.0, 40)).sum(-1) / np.sqrt(40.0)
-    grey = np.where(on, light * (120.0 + 50.0 * texture), 30.0)
+    grey = np.full((HEIGHT, WIDTH), 30.0)
+    grey[on] = light * (120.0 + 50.0 * texture)
     return np.repeat(grey.round().clip(0, 255).astype(np.uint8)[..., None], 3, axis=2), on

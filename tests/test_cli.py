@@ -247,6 +247,25 @@ def test_help_and_refusals_do_not_wait_for_torch() -> None:
     assert done.stdout == "False\n"
 
 
+def test_modules_load_without_a_search_for_cycles() -> None:
+    """In the block that loads torch, whatever becomes of it; a later block is an ordinary one."""
+    script = """
+import gc, sys, types
+from bigs.cli.terminal import importing
+try:
+    with importing():
+        print(gc.isenabled())
+        sys.modules["torch"] = types.ModuleType("torch")
+        raise ImportError
+except ImportError:
+    print(gc.isenabled(), gc.get_freeze_count() > 10_000)
+with importing():
+    print(gc.isenabled())
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["False", "True True", "True"]
+
+
 @pytest.mark.parametrize("code", [0, 3])
 def test_the_process_ends_without_a_search_for_cycles(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     def leave() -> None:

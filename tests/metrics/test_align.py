@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bigs.metrics import align
 from bigs.metrics.align import similarity_icp
 from bigs.metrics.shape import chamfer
 
@@ -63,6 +64,24 @@ def test_same_input_same_score(drill):
     first, second = similarity_icp(*arguments), similarity_icp(*arguments)
     assert first.score == second.score
     assert np.array_equal(first.rotation, second.rotation)
+
+
+def test_starts_that_came_to_the_same_place_are_finished_once(drill, monkeypatch):
+    finished = []
+
+    def icp(source, target, starts, iterations, run=align._icp):
+        finished.append(len(starts))
+        return run(source, target, starts, iterations)
+
+    monkeypatch.setattr(align, "_icp", icp)
+    verts = np.asarray(drill.vertices)[::2]
+    arguments = (verts @ Rotation.random(random_state=0).as_matrix(), verts)
+    some = similarity_icp(*arguments)
+    monkeypatch.setattr(align, "_SAME", 0.0)
+    every = similarity_icp(*arguments)
+    assert finished[0] == finished[2] == 60 and finished[1] < 0.7 * finished[3]
+    assert np.allclose(some.rotation, every.rotation, atol=1e-3)
+    assert some.score.chamfer.squared == pytest.approx(every.score.chamfer.squared, rel=2e-3, abs=1e-4)
 
 
 def test_a_shape_without_extent_is_only_moved(drill):
