@@ -62,9 +62,10 @@ def test_shares_are_those_of_every_sample_in_every_triangle(both_hands: dict[Sid
     shares = covered(points, both_hands["right"].faces)
     assert 100 < float(shares[0].sum()) < 1500
     for frame in range(len(points)):
+        expected = twin(points[frame], both_hands["right"].faces)
         # A sample on a border may belong to either side.
-        np.testing.assert_allclose(shares[frame], twin(points[frame], both_hands["right"].faces), atol=1 / 32)
-        assert float((shares[frame].numpy() - twin(points[frame], both_hands["right"].faces)).mean()) < 1e-4
+        np.testing.assert_allclose(shares[frame], expected, atol=1 / 32)
+        assert float((shares[frame].numpy() - expected).mean()) < 1e-4
     turned_over = both_hands["right"].faces.flip(-1)
     assert torch.equal(covered(points, turned_over), shares)
     single = covered(points.float(), both_hands["right"].faces)

@@ -81,17 +81,22 @@ def _revolved(radius: np.ndarray, z: np.ndarray, profile: np.ndarray) -> tuple[n
 
     The slope [N, 2] is the unit gradient over (radius, z).
     """
-    p = np.stack([radius, z], axis=1)
-    nearest, best = np.zeros_like(p), np.full(len(p), np.inf)
-    for a, b in pairwise(profile):
-        q = a + np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)[:, None] * (b - a)
-        away = np.linalg.norm(p - q, axis=1)
-        nearest = np.where((away < best)[:, None], q, nearest)
-        best = np.minimum(best, away)
+    best = np.full(len(radius), np.inf)
+    away_r, away_z = np.zeros_like(best), np.zeros_like(best)
+    for (from_r, from_z), (to_r, to_z) in pairwise(profile):
+        dr, dz = to_r - from_r, to_z - from_z
+        share = (((radius - from_r) * dr + (z - from_z) * dz) / (dr * dr + dz * dz)).clip(0.0, 1.0)
+        r, h = radius - (from_r + share * dr), z - (from_z + share * dz)
+        squared = r * r + h * h
+        nearer = squared < best
+        for found, value in ((best, squared), (away_r, r), (away_z, h)):
+            np.copyto(found, value, where=nearer)
+    best = np.sqrt(best)
     widest = np.interp(z, profile[1:-1, 1], profile[1:-1, 0])
     inside = (radius < widest) & (z > profile[0, 1]) & (z < profile[-1, 1])
     sign = np.where(inside, -1.0, 1.0)
-    return sign * best, (sign / np.maximum(best, 1e-9))[:, None] * (p - nearest)
+    slope = (sign / np.maximum(best, 1e-9))[:, None] * np.stack([away_r, away_z], axis=1)
+    return sign * best, slope
 
 
 BOX_HALF = np.array([0.037, 0.026, 0.094])

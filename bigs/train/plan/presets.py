@@ -105,28 +105,6 @@ _CONTACT = OptimizeStage(
     image_size=160,
     stop_patience=_SETTLED,
 )
-# The hand's shape and skinning are the template's: colours of so few steps say nothing better about them. The
-# object's shape is learned from here on, since poor masks leave it a wrong start.
-_APPEARANCE = OptimizeStage(
-    name="appearance",
-    step="single-subject",
-    steps=40,
-    lrs={
-        "hand.triplane": 1e-2,
-        "hand.appearance": 2e-3,
-        "hand.color": 1e-2,
-        "object.triplane": 1e-2,
-        "object.appearance": 2e-3,
-        "object.geometry": 5e-4,
-        "scene.light": 1e-2,
-        "scene.shade": 1e-2,
-        "scene.ambient": 1e-2,
-    },
-    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
-    image_size=240,
-    frames_per_step=6,
-)
-
 # What steps from a frame's own start cannot mend.
 _MOVES = MoveStage(
     name="moves",
@@ -146,12 +124,52 @@ _REGRASP = OptimizeStage(
     stop_patience=_SETTLED,
 )
 
+# What keeps Gaussians near their place, size and colour where pictures say little.
+_SHAPE_PRIORS = {"scale": 100.0, "offset": 0.02, "color_prior": 0.05, "thickness": 0.5}
+# Every Gaussian has parameters of its own before colours are learned (`SplitStage`): start values have the
+# pictures' colours, from which fields lead to no better place, in steps that take nearly twice the time.
+# Images are too coarse for finer Gaussians of the object; `RefineStage` splits them later.
+_FREED = SplitStage(parts=1)
+# The hand's shape is the template's: colours of so few steps say nothing better about it. The object's shape
+# is learned from here on, since poor masks leave it a wrong start.
+_APPEARANCE = OptimizeStage(
+    name="appearance",
+    step="single-subject",
+    steps=40,
+    lrs={
+        "hand.color": 0.05,
+        "object.color": 0.05,
+        "object.shift": 1e-4,
+        "object.size": 0.005,
+        "object.opacity": 0.01,
+        "scene.light": 1e-2,
+        "scene.shade": 1e-2,
+        "scene.ambient": 1e-2,
+    },
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, **_SHAPE_PRIORS},
+    image_size=240,
+    frames_per_step=6,
+)
+# The same with the paper's fields, for plans that begin with them.
+_FIELDS = replace(
+    _APPEARANCE,
+    lrs={
+        "hand.triplane": 1e-2,
+        "hand.appearance": 2e-3,
+        "hand.color": 1e-2,
+        "object.triplane": 1e-2,
+        "object.appearance": 2e-3,
+        "object.geometry": 5e-4,
+        "scene.light": 1e-2,
+        "scene.shade": 1e-2,
+        "scene.ambient": 1e-2,
+    },
+    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
+)
+
 # What keeps poses, shape and appearance plausible while everything moves together.
 _PLAUSIBLE_TOGETHER = {
-    "scale": 100.0,
-    "offset": 0.02,
-    "color_prior": 0.05,
-    "thickness": 0.5,
+    **_SHAPE_PRIORS,
     "shade_prior": 0.01,
     **_POSE_PRIORS,
     # Colours now say what these priors had to say before.
@@ -165,10 +183,7 @@ _PLAUSIBLE_TOGETHER = {
     "object_acceleration": 0.005,
     "object_prior": 0.1,
 }
-# Images of `joint` are too coarse for finer Gaussians of the object; `RefineStage` splits them later.
-_FREED = SplitStage(parts=1)
-# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once. Fields
-# have given shape and rough colours; from here on every Gaussian has parameters of its own (`SplitStage`).
+# Everything together: occlusion order, colours and silhouettes agree on poses and appearance at once.
 _JOINT = OptimizeStage(
     name="joint",
     step="interacting-subjects",
@@ -258,13 +273,13 @@ FAST = RunConfig(
         ScaleSearchStage(),
         GraspStage(),
         _GRASPED,
-        _APPEARANCE,
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
         _MOVES,
         _REGRASP,
         _FREED,
+        _APPEARANCE,
         _JOINT,
         RefineStage(),
         _DETAIL,
@@ -282,7 +297,7 @@ DEMO = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=30),
-        replace(_APPEARANCE, steps=25),
+        replace(_FIELDS, steps=25),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=30),
         _MOVES,
@@ -312,7 +327,6 @@ FULL = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=50),
-        replace(_APPEARANCE, steps=80),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=50),
@@ -320,6 +334,7 @@ FULL = replace(
         # Every step brings outlines nearer, and poses with them, long after the loss looks settled.
         replace(_REGRASP, steps=160, stop_patience=0),
         _FREED,
+        replace(_APPEARANCE, steps=80),
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
         RefineStage(image_size=640),
         replace(
@@ -347,7 +362,7 @@ SMOKE = replace(
         ScaleSearchStage(candidates=15),
         GraspStage(),
         replace(_GRASPED, steps=8, image_size=80),
-        replace(_APPEARANCE, steps=10, image_size=80, frames_per_step=3),
+        replace(_FIELDS, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
         replace(_MOVES, trial_steps=(3, 3), image_size=80, rounds=2),
         replace(_REGRASP, steps=8, image_size=80),
