@@ -150,7 +150,7 @@ _APPEARANCE = OptimizeStage(
     image_size=240,
     frames_per_step=6,
 )
-# The same with the paper's fields, for plans that begin with them.
+# The same with the paper's fields, so that tests split those, too.
 _FIELDS = replace(
     _APPEARANCE,
     lrs={
@@ -297,12 +297,12 @@ DEMO = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=30),
-        replace(_FIELDS, steps=25),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=30),
         _MOVES,
         replace(_REGRASP, steps=45),
         SplitStage(),
+        replace(_APPEARANCE, steps=25),
         replace(_JOINT, steps=90),
         CompletionStage(),
         GuidanceStage(steps=150),

@@ -1,7 +1,5 @@
 //! Groups of a hand's vertices, and which of a group reach furthest into an object.
 
-use std::cmp::Ordering;
-
 use bigs_raster::Vectors;
 
 use crate::OpsError;
@@ -48,25 +46,23 @@ impl Deepest {
     /// The mean of the least of the hand's distances; `bit` is set for the vertices that count. Of equal distances the
     /// first are taken.
     pub(crate) fn mark<T: Vectors>(&self, distances: &[T], among: &mut [u32], bit: u32) -> T {
-        let order = |a: &T, b: &T| a.as_f64().total_cmp(&b.as_f64());
-        let mut sorted: Vec<T> = self.vertices.iter().map(|&vertex| distances[vertex]).collect();
-        let (less, &mut last, _) = sorted.select_nth_unstable_by(self.count - 1, order);
-        let mut equal = self.count - less.iter().filter(|d| order(d, &last).is_lt()).count();
+        // As integers, which take no branch to compare.
+        let mut keys: Vec<T::Key> = self
+            .vertices
+            .iter()
+            .map(|&vertex| distances[vertex].key())
+            .collect();
+        let (less, &mut last, _) = keys.select_nth_unstable(self.count - 1);
+        let mut equal = self.count - less.iter().filter(|&&key| key < last).count();
         let mut sum = T::ZERO;
         for &vertex in &self.vertices {
-            let counts = match order(&distances[vertex], &last) {
-                Ordering::Less => true,
-                Ordering::Greater => false,
-                Ordering::Equal => {
-                    let taken = equal > 0;
-                    equal = equal.saturating_sub(1);
-                    taken
-                }
-            };
-            if counts {
-                sum += distances[vertex];
-                among[vertex] |= bit;
+            let key = distances[vertex].key();
+            if key > last || key == last && equal == 0 {
+                continue;
             }
+            equal -= usize::from(key == last);
+            sum += distances[vertex];
+            among[vertex] |= bit;
         }
         sum / T::of(self.count as f64)
     }
