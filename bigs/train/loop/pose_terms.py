@@ -123,7 +123,7 @@ def contact(step: Step) -> Tensor:
             for side, joints in step.joints.items()
         )
     return mean_of(
-        surface_contact(touch.depths[:, 0], step.evidence.touching[side])
+        surface_contact(touch.depths[:, 0], step.evidence.touching[side][step.touch_frames])
         for side, touch in step.touches.items()
     )
 
@@ -138,7 +138,7 @@ def finger_contact(step: Step) -> Tensor:
     grasps = step.scene.grasps
     # Hands that hold nothing say 0.
     each = [
-        fingers_on_surface(touch.depths[:, 1:], grasps[side].certainty)
+        fingers_on_surface(touch.depths[:, 1:], grasps[side].certainty[step.touch_frames])
         for side, touch in step.touches.items()
     ]
     holding = sum(bool(grasps[side].count) for side in step.touches)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -45,3 +47,20 @@ def test_a_term_is_the_mean_of_what_it_says_of_each_hand(
     assert left > 1.2 * right > 0
     found = TERMS[name](Step(moving, evidence, {}, Selection(torch.arange(moving.n_frames))))
     torch.testing.assert_close(found, (right + left) / 2)
+
+
+@pytest.mark.parametrize("name", ["contact", "finger_contact", "penetration"])
+def test_steps_on_some_frames_measure_touch_in_turns(moving: Scene, evidence: Evidence, name: str) -> None:
+    """Where all frames count alike, three steps together say what one on the whole clip does."""
+    count = moving.n_frames
+    evidence = replace(evidence, contact="surface", touching=dict.fromkeys(moving.sides, torch.ones(count)))
+    clip = moving.at(torch.arange(count))
+    for side in moving.sides:
+        held = torch.zeros(count, dtype=torch.long)
+        moving.grasps[side].set(held, 0.1, clip.canonical_hand(side), clip.object, torch.ones(count))
+    whole = TERMS[name](Step(moving, evidence, {}, Selection(torch.arange(count))))
+    some = [Step(moving, evidence, {}, Selection(torch.tensor([0, 2]), seed=seed)) for seed in range(3)]
+    assert torch.cat([step.touch_frames for step in some]).sort().values.tolist() == list(range(count))
+    each = torch.stack([TERMS[name](step) for step in some])
+    assert len(each.unique()) > 1
+    torch.testing.assert_close(each.mean(), whole)
