@@ -32,7 +32,7 @@ class FreeGaussians(nn.Module):
         self.register_buffer("opacity_logits", torch.zeros(count))
         self.register_buffer("color_logits", torch.zeros(count, 3))
         self.register_buffer("normals", torch.zeros(count, 3))
-        # Factor on each Gaussian's residuals, at most 1: one that hardly shows stays as its field made it.
+        # Factor on each Gaussian's residuals, at most 1: one that hardly shows stays as it began.
         self.register_buffer("freedom", torch.ones(count))
         # Along the normal, metres: along the surface there are Gaussians already.
         self.shift = nn.Parameter(torch.zeros(count))

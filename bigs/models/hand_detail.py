@@ -15,7 +15,7 @@ from bigs.models.hand_splats import HandSplats
 class HandDetail(FreeGaussians):
     """A canonical right hand without a field; replaces `HandSplats` in a scene.
 
-    How its Gaussians follow the shape and the bones is settled: it stays as the field left it.
+    How its Gaussians follow the shape and the bones is settled.
     """
 
     shapedirs: Tensor

@@ -117,7 +117,7 @@ def guide_object(
     parameters = {name: getattr(detail, name) for name in rates}
     found = {name: value.clone() for name, value in detail.state_dict().items()}
     unseen = ~coverage.seen
-    # What hardly shows kept what its field made of it. Now it is the prior's.
+    # What hardly shows kept what it began with. Now it is the prior's.
     detail.release(unseen)
     with torch.no_grad():
         start = detail().means.clone()
