@@ -150,7 +150,8 @@ _APPEARANCE = OptimizeStage(
     image_size=240,
     frames_per_step=6,
 )
-# The same with the paper's fields, so that tests split those, too.
+# The same with the paper's fields, for plans that free Gaussians after it. Fields darken skin that a sleeve
+# hides; over a thousand later steps it grows below the sleeve, and bright skin would show as rays.
 _FIELDS = replace(
     _APPEARANCE,
     lrs={
@@ -327,6 +328,7 @@ FULL = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=50),
+        replace(_FIELDS, steps=80),
         ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=50),
@@ -334,7 +336,6 @@ FULL = replace(
         # Every step brings outlines nearer, and poses with them, long after the loss looks settled.
         replace(_REGRASP, steps=160, stop_patience=0),
         _FREED,
-        replace(_APPEARANCE, steps=80),
         replace(_JOINT, steps=300, weights=_JOINT.weights | _FIRM_OBJECT | _CALM_HANDS),
         RefineStage(image_size=640),
         replace(
