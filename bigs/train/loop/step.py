@@ -263,7 +263,7 @@ class Step:
     def touch_frames(self) -> Tensor:
         """Indices [S] of the frames in which touch is measured, rising."""
         count = self.scene.n_frames
-        every = 1 if len(self.frames) == count else _TOUCH_EVERY
+        every = 1 if len(self.frames) == count else min(_TOUCH_EVERY, count)
         return torch.arange(self.selection.seed % every, count, every)
 
     @cached_property

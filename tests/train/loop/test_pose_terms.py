@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -64,3 +65,15 @@ def test_steps_on_some_frames_measure_touch_in_turns(moving: Scene, evidence: Ev
     each = torch.stack([TERMS[name](step) for step in some])
     assert len(each.unique()) > 1
     torch.testing.assert_close(each.mean(), whole)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 60])
+def test_every_frame_has_its_turn(count: int) -> None:
+    """However few there are: terms are means, and nothing has none."""
+    scene = SimpleNamespace(n_frames=count)
+    turns = [
+        Step(scene, None, {}, Selection(torch.tensor([0]), seed=seed)).touch_frames
+        for seed in range(min(count, 3))
+    ]
+    assert all(map(len, turns))
+    assert torch.cat(turns).sort().values.tolist() == list(range(count))
