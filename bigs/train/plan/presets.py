@@ -124,6 +124,8 @@ _REGRASP = OptimizeStage(
     stop_patience=_SETTLED,
 )
 
+_LIGHT_RATES = {"scene.light": 1e-2, "scene.shade": 1e-2, "scene.ambient": 1e-2}
+_LOOKS = {"image": 1.0, "coverage": 0.2, "shade_prior": 0.02}
 # What keeps Gaussians near their place, size and colour where pictures say little.
 _SHAPE_PRIORS = {"scale": 100.0, "offset": 0.02, "color_prior": 0.05, "thickness": 0.5}
 # Every Gaussian has parameters of its own before colours are learned (`SplitStage`): start values have the
@@ -142,11 +144,9 @@ _APPEARANCE = OptimizeStage(
         "object.shift": 1e-4,
         "object.size": 0.005,
         "object.opacity": 0.01,
-        "scene.light": 1e-2,
-        "scene.shade": 1e-2,
-        "scene.ambient": 1e-2,
+        **_LIGHT_RATES,
     },
-    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, **_SHAPE_PRIORS},
+    weights={**_LOOKS, **_SHAPE_PRIORS},
     image_size=240,
     frames_per_step=6,
 )
@@ -161,11 +161,9 @@ _FIELDS = replace(
         "object.triplane": 1e-2,
         "object.appearance": 2e-3,
         "object.geometry": 5e-4,
-        "scene.light": 1e-2,
-        "scene.shade": 1e-2,
-        "scene.ambient": 1e-2,
+        **_LIGHT_RATES,
     },
-    weights={"image": 1.0, "coverage": 0.2, "shade_prior": 0.02, "scale": 100.0},
+    weights={**_LOOKS, "scale": 100.0},
 )
 
 # What keeps poses, shape and appearance plausible while everything moves together.

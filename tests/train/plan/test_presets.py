@@ -8,7 +8,7 @@ import pytest
 
 from bigs.checks import InputError
 from bigs.train.check_plan import check_plan
-from bigs.train.loop.optim import GROUPS
+from bigs.train.loop.optim import GROUPS, ONLY_IN_FIELDS
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
 from bigs.train.plan.config import OptimizeStage, RefineStage, RunConfig
 from bigs.train.plan.presets import PRESETS, SMOKE
@@ -109,6 +109,13 @@ def test_without_the_split_fields_are_trained_to_the_end(name: str) -> None:
     joint = next(stage for stage in kept.stages if stage.name == "joint")
     assert {"hand.triplane", "hand.geometry", "object.appearance", "hand.color"} <= set(joint.lrs)
     assert not {"hand.shift", "object.opacity", "object.color"} & set(joint.lrs)
+
+
+@pytest.mark.parametrize(("name", "trained"), [("demo", False), ("fast", False), ("full", True)])
+def test_who_trains_fields_before_they_are_split(name: str, trained: bool) -> None:
+    stages = [stage for stage in PRESETS[name].stages if isinstance(stage, OptimizeStage)]
+    groups = set().union(*(stage.lrs for stage in stages))
+    assert bool(groups & set().union(*ONLY_IN_FIELDS.values())) is trained
 
 
 def test_image_terms_do_not_hide_other_terms() -> None:
