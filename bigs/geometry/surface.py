@@ -219,8 +219,15 @@ def blend_with_points(
     return DistanceGrid(values.reshape(grid.values.shape), grid.origin, grid.spacing)
 
 
-def extract_mesh(grid: DistanceGrid) -> tuple[np.ndarray, np.ndarray]:
+# A piece of a surface is one of its own if this many points lie on it: single ones are strays.
+_OWN_POINTS = 8
+
+
+def extract_mesh(grid: DistanceGrid, points: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The zero level set's largest piece: vertices [V, 3] and faces [F, 3] with outward winding.
+
+    Something thin, such as a handle, may lose its hold where the grid is smoothed. So pieces on which
+    `points` [N, 3], measured on the object, lie are kept as well.
 
     Raises:
         ValueError: the grid has no zero crossing.
@@ -229,8 +236,12 @@ def extract_mesh(grid: DistanceGrid) -> tuple[np.ndarray, np.ndarray]:
     verts, faces, _, _ = skimage.measure.marching_cubes(padded, 0.0, spacing=(grid.spacing,) * 3)
     verts = verts + grid.origin - grid.spacing
     label = _components(len(verts), faces)
-    largest = np.bincount(label[faces[:, 0]]).argmax()
-    faces = faces[label[faces[:, 0]] == largest]
+    count = np.bincount(label[faces[:, 0]])
+    kept = np.arange(len(count)) == count.argmax()
+    if points is not None and len(count) > 1:
+        owner = label[scipy.spatial.cKDTree(verts).query(points)[1]]
+        kept |= np.bincount(owner, minlength=len(count)) >= _OWN_POINTS
+    faces = faces[kept[label[faces[:, 0]]]]
     used, faces = np.unique(faces, return_inverse=True)
     verts, faces = verts[used], faces.reshape(-1, 3)
     corners = verts[faces]

@@ -262,15 +262,34 @@ def test_mesh_is_closed_where_the_solid_meets_the_grids_border() -> None:
     assert mesh.is_watertight and 1.0 < mesh.volume < (1 + 2 / 8) ** 3
 
 
-def test_mesh_is_the_largest_piece_alone() -> None:
+def two_balls() -> DistanceGrid:
+    """A large one and a small one, apart."""
     grid = empty_grid(np.zeros(3), np.array([1.0, 0.5, 0.5]), 40)
     points = grid.points()
     large = np.linalg.norm(points - [0.25, 0.25, 0.25], axis=-1) - 0.2
     small = np.linalg.norm(points - [0.8, 0.25, 0.25], axis=-1) - 0.1
-    both = DistanceGrid(np.minimum(large, small).reshape(grid.values.shape), grid.origin, grid.spacing)
-    verts, faces = extract_mesh(both)
+    return DistanceGrid(np.minimum(large, small).reshape(grid.values.shape), grid.origin, grid.spacing)
+
+
+def test_mesh_is_the_largest_piece_alone() -> None:
+    verts, faces = extract_mesh(two_balls())
     np.testing.assert_allclose(np.linalg.norm(verts - 0.25, axis=1), 0.2, atol=2e-3)
     assert set(np.unique(faces)) == set(range(len(verts)))
+
+
+def test_pieces_on_which_points_lie_are_kept() -> None:
+    """A handle may come off where a surface is smoothed; a few strays make no piece of the object."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(108, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    large = 0.25 + 0.2 * directions[:100]
+    small = [0.8, 0.25, 0.25] + 0.1 * directions[100:]
+    alone = extract_mesh(two_balls())
+    few = extract_mesh(two_balls(), np.concatenate([large, small[:7]]))
+    assert all((a == b).all() for a, b in zip(alone, few, strict=True))
+    mesh = trimesh.Trimesh(*extract_mesh(two_balls(), np.concatenate([large, small])), process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * (0.2**3 + 0.1**3), rel=0.02)
 
 
 def test_an_empty_grid_has_no_mesh() -> None:

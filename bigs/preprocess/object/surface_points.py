@@ -79,7 +79,7 @@ def complete_points(
     usable = np.flatnonzero(sfm.confidence > 0) if (sfm.confidence > 0).any() else np.arange(len(masks))
     views = ObjectViews(masks[usable] == MASK_VALUES["object"], K, poses[0][usable], poses[1][usable])
     spacing = config.sparser * float(np.median(neighbour_distances(core)))
-    samples, normals = _samples(surface, spacing)
+    samples, normals = _samples(surface, core, spacing)
     bare = np.flatnonzero(scipy.spatial.cKDTree(core).query(samples)[0] > config.gap)
     times = times_seen(views, samples[bare], normals[bare], samples, config.tolerance)
     told = (times >= config.least_seen) & (hull.distance(samples[bare]) > -config.tight)
@@ -140,9 +140,9 @@ def _lent(points: np.ndarray, colors: np.ndarray, others: np.ndarray, theirs: np
 _LENDERS = 3
 
 
-def _samples(surface: DistanceGrid, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Dense samples [N, 3] of a surface and their normals [N, 3], the same in every run."""
-    verts, faces = extract_mesh(surface)
+def _samples(surface: DistanceGrid, points: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Dense samples [N, 3] of a surface through points [M, 3], and their normals; the same in every run."""
+    verts, faces = extract_mesh(surface, points)
     mesh = trimesh.Trimesh(verts, faces, process=False)
     count = max(int(_DENSITY * mesh.area / spacing**2), 1)
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)

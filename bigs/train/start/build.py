@@ -162,7 +162,7 @@ def _object_surfaces(
     try:
         hull = find_object_hull(clip, unknown, start, initial)
         grid = hull.closed(initial, hull.points, hull.normals)
-        closed = extract_mesh(grid)
+        closed = extract_mesh(grid, hull.points)
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid)

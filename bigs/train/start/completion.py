@@ -64,7 +64,7 @@ def complete(
     """
     plain = hull.closed(initial, hull.points, hull.normals)
     points, normals, seen = seen_samples(
-        hull.views, *extract_mesh(plain), initial.seen_frames, initial.seen_tolerance
+        hull.views, *extract_mesh(plain, hull.points), initial.seen_frames, initial.seen_tolerance
     )
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:

@@ -97,7 +97,7 @@ def complete_scene(
     splats, surface = scene.object_splats, scene.object_surface
     detail = splats if isinstance(splats, ObjectDetail) else split_object(canonical, 1, 0.0)
     left = weights_in_pictures(scene, evidence) >= SHOWS
-    verts, faces = extract_mesh(found.surface)
+    verts, faces = extract_mesh(found.surface, np.concatenate([hull.points, found.points]))
     added = _far_side(canonical, left.numpy(), found, verts, faces, obj)
     for _ in range(_PASSES):
         scene.object_splats = replace_gaussians(detail, left, added)
