@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -22,6 +25,8 @@ class FreeGaussians(nn.Module):
     color_logits: Tensor
     normals: Tensor
     freedom: Tensor
+    # Logarithmic, of any axis.
+    most_growth: ClassVar[float] = math.inf
 
     def __init__(self, count: int) -> None:
         """Room for `count` Gaussians; `start` fills it."""
@@ -56,7 +61,7 @@ class FreeGaussians(nn.Module):
         """Let those `chosen` [N] (bool) change as much as any from now on; they stay as they are."""
         free = (self.freedom * chosen)[:, None]
         self.base_points += free * self.shift[:, None] * self.normals
-        self.base_log_scales += free * self.size
+        self.base_log_scales += chosen[:, None] * self._growth
         self.opacity_logits += free[:, 0] * self.opacity
         self.color_logits += free * self.color
         for residual in self.parameters():
@@ -71,7 +76,12 @@ class FreeGaussians(nn.Module):
     @property
     def scales(self) -> Tensor:
         """Standard deviations [N, 3], metres."""
-        return (self.base_log_scales + self.freedom[:, None] * self.size).exp()
+        return (self.base_log_scales + self._growth).exp()
+
+    @property
+    def _growth(self) -> Tensor:
+        """[N, 3], logarithmic."""
+        return (self.freedom[:, None] * self.size).clamp_max(self.most_growth)
 
     @property
     def opacities(self) -> Tensor:

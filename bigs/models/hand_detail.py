@@ -21,6 +21,9 @@ class HandDetail(FreeGaussians):
     shapedirs: Tensor
     posedirs: Tensor | None
     base_weights: Tensor
+    # Five times as large. What explains the edge of a sleeve would become a ray below it, where no picture
+    # forbids anything.
+    most_growth = 1.6
 
     def __init__(self, model: HandModel, splats: CanonicalHand) -> None:
         """`model` is the right hand; `splats` says how many Gaussians, and how they follow shape and pose."""

@@ -72,6 +72,22 @@ def test_what_hardly_shows_stays_as_its_field_made_it(field: HandSplats) -> None
     assert not detail.color.grad[:5].any() and detail.color.grad[5:].any()
 
 
+def test_no_gaussian_of_a_hand_grows_without_end(field: HandSplats) -> None:
+    """Below a sleeve nothing forbids it, and it would show as a ray."""
+    detail = free_hand(field)
+    start = detail()
+    with torch.no_grad():
+        detail.size[0], detail.size[1], detail.size[2] = 1.5, 4.0, -4.0
+    grown = detail().scales
+    growth = (grown / start.scales)[:3].log()
+    torch.testing.assert_close(growth, torch.tensor([[1.5], [1.6], [-4.0]]).expand(3, 3))
+    grown.sum().backward()
+    assert detail.size.grad[:3].bool().all(-1).tolist() == [True, False, True]
+    before = detail()
+    detail.release(torch.arange(len(detail.size)) < 3)
+    torch.testing.assert_close(detail().scales, before.scales)
+
+
 def test_freed_twice_is_freed_once(field: HandSplats) -> None:
     once = free_hand(field)
     with torch.no_grad():
