@@ -76,16 +76,17 @@ def find_symmetries(
         surface: what was seen, at least a few hundred samples.
         is_empty: where nothing is.
         config: what counts as strong.
-        earlier: symmetries with strong evidence on a surface much like this one. They are candidates that are
-            near the right place: where the votes lead, another may pass before the right one is polished.
+        earlier: symmetries with strong evidence on a surface much like this one. If it is still strong for
+            one of them nearby, no other of its kind is looked for: that takes seconds.
     """
     found: list[Symmetry] = []
     while len(found) < _MOST and len(surface.points) >= 100:
         judge = _Judge(surface, is_empty, config)
         # An axis completes more than any plane, and only a body of revolution passes as one.
         axes, planes = ([s for s in earlier if s.kind == kind] for kind in ("axis", "plane"))
-        best = None if found else judge.best(_axis_candidates(surface), found, axes)
-        best = best or judge.best(_plane_candidates(surface) + judge.planes_across(found), found, planes)
+        best = None if found else judge.strongest(axes, found) or judge.best(_axis_candidates(surface), found)
+        best = best or judge.strongest(planes, found)
+        best = best or judge.best(_plane_candidates(surface) + judge.planes_across(found), found)
         if best is None:
             break
         found.append(best)
@@ -153,23 +154,23 @@ class _Judge:
                     found.append(Symmetry("plane", middle, normal))
         return self._placed(found)
 
-    def best(
-        self, candidates: list[Symmetry], known: list[Symmetry], earlier: list[Symmetry]
-    ) -> Symmetry | None:
-        """The refined candidate, or the earlier one, that agrees best; None if that is not enough."""
-        if not candidates:
-            return None
+    def best(self, candidates: list[Symmetry], known: list[Symmetry]) -> Symmetry | None:
+        """The refined candidate that agrees best; None if that is not enough."""
         finalists = self._distinct(self.ranked(candidates), known)[:_FINALISTS]
         refined = self._distinct(self.ranked(self._placed(self._refined(finalists))), known)
         for first in range(0, len(refined), _POLISHED):
-            chosen = refined[first : first + _POLISHED]
-            if first == 0:
-                chosen += self._distinct(earlier, known)
-            polished = [self._polished(symmetry) for symmetry in chosen]
-            for symmetry in self.ranked(polished):
-                (found,) = self.agreement([symmetry])
-                if self._is_strong(symmetry, found, known):
-                    return replace(symmetry, support=found.support, contradiction=found.contradiction)
+            found = self.strongest(refined[first : first + _POLISHED], known)
+            if found is not None:
+                return found
+        return None
+
+    def strongest(self, near: Sequence[Symmetry], known: list[Symmetry]) -> Symmetry | None:
+        """The one that agrees best of symmetries `near` the right place, moved there; None if not enough."""
+        polished = [self._polished(symmetry) for symmetry in self._distinct(near, known)]
+        for symmetry in self.ranked(polished):
+            (found,) = self.agreement([symmetry])
+            if self._is_strong(symmetry, found, known):
+                return replace(symmetry, support=found.support, contradiction=found.contradiction)
         return None
 
     def _distinct(self, symmetries: Sequence[Symmetry], known: Sequence[Symmetry]) -> list[Symmetry]:
@@ -263,7 +264,7 @@ class _Judge:
 
 def _rows(symmetries: Sequence[Symmetry]) -> np.ndarray:
     """Points and directions [M, 6]."""
-    return np.array([[*symmetry.point, *symmetry.direction] for symmetry in symmetries])
+    return np.array([[*symmetry.point, *symmetry.direction] for symmetry in symmetries]).reshape(-1, 6)
 
 
 def _alike(a: Symmetry, b: Symmetry, size: float) -> bool:

@@ -69,20 +69,28 @@ def test_planes_of_a_wedge_that_has_one() -> None:
     assert after < before - 0.1
 
 
-def test_earlier_symmetries_are_candidates_and_judged_like_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_earlier_symmetries_come_first_and_are_judged_like_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that is a little off leads to the right place where no vote does; a wrong one leads nowhere."""
     outline = np.array([[0.0, 0.0], [0.15, 0.0], [0.03, 0.09]])
     wedge = trimesh.creation.extrude_triangulation(outline, np.array([[0, 1, 2]]), 0.08)
     surface, _ = seen_of(wedge, color_axis=0)
     nowhere = Symmetry("plane", np.array([0.14, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
-    monkeypatch.setattr(symmetry_search, "_plane_candidates", lambda surface: [nowhere])
+    searched = []
+
+    def candidates(surface: SeenSurface) -> list[Symmetry]:
+        searched.append(len(surface.points))
+        return [nowhere]
+
+    monkeypatch.setattr(symmetry_search, "_plane_candidates", candidates)
     monkeypatch.setattr(symmetry_search, "_axis_candidates", lambda surface: [])
-    assert find_symmetries(surface, outside(wedge)) == []
+    assert find_symmetries(surface, outside(wedge)) == [] and searched == [len(surface.points)]
+    searched.clear()
     turned = np.array([np.sin(np.radians(3.0)), 0.0, np.cos(np.radians(3.0))])
     near = Symmetry("plane", np.array([0.06, 0.03, 0.043]), turned)
     found = find_symmetries(surface, outside(wedge), earlier=[nowhere, near])[0]
     assert abs(found.direction[2]) > np.cos(np.radians(1.0))
     assert abs((found.point - [0, 0, 0.04]) @ found.direction) < 2e-3
+    assert len(surface.points) not in searched
     assert find_symmetries(surface, outside(wedge), earlier=[nowhere]) == []
 
 
