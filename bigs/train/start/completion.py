@@ -59,7 +59,7 @@ def complete(
 
     Args:
         hull, start, initial, config: see those classes.
-        earlier: symmetries for which the evidence was strong before; they are candidates, and they count if
+        earlier: symmetries for which the evidence was strong before; they are tried first, and count if
             the evidence is not strong for any now.
     """
     plain = hull.closed(initial, hull.points, hull.normals)
