@@ -223,11 +223,13 @@ def blend_with_points(
 _OWN_POINTS = 8
 
 
-def extract_mesh(grid: DistanceGrid, points: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The zero level set's largest piece: vertices [V, 3] and faces [F, 3] with outward winding.
+def extract_mesh(grid: DistanceGrid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The zero level set's largest piece, and those on which points [N, 3] of the object lie.
 
-    Something thin, such as a handle, may lose its hold where the grid is smoothed. So pieces on which
-    `points` [N, 3], measured on the object, lie are kept as well.
+    Something thin, such as a handle, may lose its hold where a grid is smoothed.
+
+    Returns:
+        Vertices [V, 3] and faces [F, 3] with outward winding.
 
     Raises:
         ValueError: the grid has no zero crossing.
@@ -238,7 +240,7 @@ def extract_mesh(grid: DistanceGrid, points: np.ndarray | None = None) -> tuple[
     label = _components(len(verts), faces)
     count = np.bincount(label[faces[:, 0]])
     kept = np.arange(len(count)) == count.argmax()
-    if points is not None and len(count) > 1:
+    if len(count) > 1:
         owner = label[scipy.spatial.cKDTree(verts).query(points)[1]]
         kept |= np.bincount(owner, minlength=len(count)) >= _OWN_POINTS
     faces = faces[kept[label[faces[:, 0]]]]

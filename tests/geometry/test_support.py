@@ -23,13 +23,13 @@ def ball() -> DistanceGrid:
 
 @pytest.fixture(scope="module")
 def samples(ball: DistanceGrid) -> SurfaceSamples:
-    points, normals = sample_surface(*extract_mesh(ball), 4000)
+    points, normals = sample_surface(*extract_mesh(ball, np.empty((0, 3))), 4000)
     return SurfaceSamples(points, normals, points[:, 0] > 0.0)
 
 
 def test_a_surface_seen_all_around_is_left_as_it_is(ball: DistanceGrid, samples: SurfaceSamples) -> None:
     support = Support(samples._replace(seen=np.ones(len(samples.seen), dtype=bool)), NOTHING)
-    verts, faces = extract_mesh(ball)
+    verts, faces = extract_mesh(ball, np.empty((0, 3)))
     kept, kept_faces = support.known_part(verts, faces, 0.01)
     np.testing.assert_array_equal(kept, np.arange(len(verts)))
     np.testing.assert_array_equal(kept_faces, faces)
@@ -37,7 +37,7 @@ def test_a_surface_seen_all_around_is_left_as_it_is(ball: DistanceGrid, samples:
 
 
 def test_the_mesh_ends_at_its_reach(ball: DistanceGrid, samples: SurfaceSamples) -> None:
-    verts, faces = extract_mesh(ball)
+    verts, faces = extract_mesh(ball, np.empty((0, 3)))
     index, kept_faces = Support(samples, NOTHING).known_part(verts, faces, 0.02)
     kept = verts[index]
     distance = scipy.spatial.cKDTree(samples.points[samples.seen]).query(verts)[0]

@@ -25,6 +25,7 @@ MIDDLE = np.array([0.02, -0.01, 0.015])  # of the ball in the object's frame
 K = np.array([[300.0, 0, 95.0], [0, 300.0, 85.0], [0, 0, 1]])
 SIZE = (170, 190)
 PIXEL = DISTANCE / K[0, 0]  # metres per pixel at the ball
+NO_POINTS = np.empty((0, 3))
 
 
 def even_directions(count: int) -> np.ndarray:
@@ -96,7 +97,8 @@ def test_hull_of_a_ball_has_its_radius(hull: VisualHull) -> None:
     assert on_surface.max() < PIXEL
     grid = empty_grid(MIDDLE - 0.07, MIDDLE + 0.07, 40)
     verts, _ = extract_mesh(
-        DistanceGrid(hull.distance(grid.points()).reshape(grid.values.shape), grid.origin, grid.spacing)
+        DistanceGrid(hull.distance(grid.points()).reshape(grid.values.shape), grid.origin, grid.spacing),
+        NO_POINTS,
     )
     radii = np.linalg.norm(verts - MIDDLE, axis=1)
     assert radii.min() > RADIUS - PIXEL and radii.max() < 1.12 * RADIUS
@@ -225,7 +227,7 @@ def test_scattered_points_do_not_shrink_what_a_tight_hull_bounds() -> None:
     blended = blend_with_points(grid, points, directions, reach=0.016)
 
     def mean_radius(surface: DistanceGrid) -> float:
-        return np.linalg.norm(extract_mesh(surface)[0] - MIDDLE, axis=1).mean()
+        return np.linalg.norm(extract_mesh(surface, NO_POINTS)[0] - MIDDLE, axis=1).mean()
 
     assert mean_radius(blended) == pytest.approx(RADIUS, abs=5e-5)
     # What planes say that may only go inwards.
@@ -248,7 +250,7 @@ def test_points_on_their_planes_do_not_scatter() -> None:
 
 
 def test_mesh_of_a_ball_is_closed_and_looks_outwards() -> None:
-    verts, faces = extract_mesh(ball_grid())
+    verts, faces = extract_mesh(ball_grid(), NO_POINTS)
     mesh = trimesh.Trimesh(verts, faces, process=False)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)
@@ -258,7 +260,7 @@ def test_mesh_of_a_ball_is_closed_and_looks_outwards() -> None:
 def test_mesh_is_closed_where_the_solid_meets_the_grids_border() -> None:
     grid = empty_grid(np.zeros(3), np.ones(3), 8)
     full = DistanceGrid(np.full(grid.values.shape, -0.1), grid.origin, grid.spacing)
-    mesh = trimesh.Trimesh(*extract_mesh(full), process=False)
+    mesh = trimesh.Trimesh(*extract_mesh(full, NO_POINTS), process=False)
     assert mesh.is_watertight and 1.0 < mesh.volume < (1 + 2 / 8) ** 3
 
 
@@ -272,7 +274,7 @@ def two_balls() -> DistanceGrid:
 
 
 def test_mesh_is_the_largest_piece_alone() -> None:
-    verts, faces = extract_mesh(two_balls())
+    verts, faces = extract_mesh(two_balls(), NO_POINTS)
     np.testing.assert_allclose(np.linalg.norm(verts - 0.25, axis=1), 0.2, atol=2e-3)
     assert set(np.unique(faces)) == set(range(len(verts)))
 
@@ -284,7 +286,7 @@ def test_pieces_on_which_points_lie_are_kept() -> None:
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     large = 0.25 + 0.2 * directions[:100]
     small = [0.8, 0.25, 0.25] + 0.1 * directions[100:]
-    alone = extract_mesh(two_balls())
+    alone = extract_mesh(two_balls(), NO_POINTS)
     few = extract_mesh(two_balls(), np.concatenate([large, small[:7]]))
     assert all((a == b).all() for a, b in zip(alone, few, strict=True))
     mesh = trimesh.Trimesh(*extract_mesh(two_balls(), np.concatenate([large, small])), process=False)
@@ -295,7 +297,7 @@ def test_pieces_on_which_points_lie_are_kept() -> None:
 def test_an_empty_grid_has_no_mesh() -> None:
     grid = empty_grid(np.zeros(3), np.ones(3), 4)
     with pytest.raises(ValueError, match="level"):
-        extract_mesh(DistanceGrid(np.ones(grid.values.shape), grid.origin, grid.spacing))
+        extract_mesh(DistanceGrid(np.ones(grid.values.shape), grid.origin, grid.spacing), NO_POINTS)
 
 
 def test_convex_distance_of_a_cube() -> None:

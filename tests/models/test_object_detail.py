@@ -127,10 +127,10 @@ def test_parameters_do_what_they_are_called() -> None:
     detail = split_object(plate(), 1, 0.0)
     start = detail()
     with torch.no_grad():
-        detail.shift[3], detail.size[4, 0], detail.opacity[5], detail.color[6, 1] = 0.002, 0.7, 1.0, -1.0
+        detail.shift[3], detail.size[4, 0], detail.opacity[5], detail.color[6, 1] = 0.002, 2.0, 1.0, -1.0
     now = detail()
     torch.testing.assert_close(now.means[3] - start.means[3], torch.tensor([0.0, 0.0, -0.002]))
-    torch.testing.assert_close(now.scales[4, 0] / start.scales[4, 0], torch.tensor(0.7).exp())
+    torch.testing.assert_close(now.scales[4, 0] / start.scales[4, 0], torch.tensor(2.0).exp())
     assert now.opacities[5] > start.opacities[5] and now.colors[6, 1] < start.colors[6, 1]
     unchanged = torch.ones(len(start.means), dtype=torch.bool)
     unchanged[3:7] = False

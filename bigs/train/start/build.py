@@ -165,7 +165,7 @@ def _object_surfaces(
         closed = extract_mesh(grid, hull.points)
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)
-        closed = extract_mesh(grid)
+        closed = extract_mesh(grid, start.points)
         why = f"object surface from masks: {reason}; using the points' convex hull instead"
         return _ObjectSurfaces(closed, None, grid, [], [why])
     support = Support(

@@ -43,7 +43,7 @@ def nothing_hides(clip: Clip) -> np.ndarray:
 
 
 def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
-    verts, faces = extract_mesh(surface)
+    verts, faces = extract_mesh(surface, np.empty((0, 3)))
     return similarity_icp(verts, truth.object_verts[0], faces, truth.object_faces).score
 
 
@@ -118,7 +118,7 @@ def test_less_counts_as_seen_the_more_frames_must_show_it(
     one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
     _, hull, _ = one_side
-    surface = extract_mesh(hull.closed(INITIAL, hull.points, hull.normals))
+    surface = extract_mesh(hull.closed(INITIAL, hull.points, hull.normals), hull.points)
     shares = [seen_samples(hull.views, *surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
     assert shares[0] > shares[1] > shares[2] > 0.0
     assert seen_samples(hull.views, *surface, 3, 0.0).seen.mean() < shares[1]
