@@ -161,8 +161,8 @@ def _object_surfaces(
 ) -> _ObjectSurfaces:
     try:
         hull = find_object_hull(clip, unknown, start, initial)
-        grid = hull.closed(initial, hull.points, hull.normals)
-        closed = extract_mesh(grid, hull.points)
+        surface = hull.closed(initial, hull.points, hull.normals)
+        grid, closed = surface.grid, surface.mesh()
     except (ValueError, scipy.spatial.QhullError) as reason:
         grid = convex_surface(start, initial)
         closed = extract_mesh(grid, start.points)
@@ -182,7 +182,7 @@ def _object_surfaces(
         symmetries = done.symmetries
         if symmetries:
             # A hull of few directions is deep: its far side is no surface that a hand could hold.
-            grid = done.surface
+            grid = done.surface.grid
         else:
             grid = support.without_guesses(grid, initial.surface_solid)
     return _ObjectSurfaces(closed, known, grid, symmetries, [])

@@ -10,19 +10,18 @@ import scipy.spatial
 
 from bigs.geometry.coverage import times_empty
 from bigs.geometry.support import seen_samples
-from bigs.geometry.surface import DistanceGrid, extract_mesh
 from bigs.geometry.symmetry import EmptySpace, SeenSurface, Symmetry, completed
 from bigs.geometry.symmetry_search import find_symmetries
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
 from bigs.train.start.initial import ObjectStart
-from bigs.train.start.visual_hull import ObjectHull
+from bigs.train.start.visual_hull import ClosedSurface, ObjectHull
 
 
 @dataclass(frozen=True)
 class Completion:
     """The object's completed surface."""
 
-    surface: DistanceGrid
+    surface: ClosedSurface
     seen: float  # share of the surface that the clip shows
     symmetries: list[Symmetry]
     points: np.ndarray  # [M, 3] the added points, metres
@@ -64,7 +63,7 @@ def complete(
     """
     plain = hull.closed(initial, hull.points, hull.normals)
     points, normals, seen = seen_samples(
-        hull.views, *extract_mesh(plain, hull.points), initial.seen_frames, initial.seen_tolerance
+        hull.views, *plain.mesh(), initial.seen_frames, initial.seen_tolerance
     )
     nothing = Completion(plain, float(seen.mean()), [], np.empty((0, 3)), np.empty((0, 3)))
     if nothing.seen >= config.enough:
@@ -80,9 +79,9 @@ def complete(
         return replace(nothing, why_not="no strong evidence for any")
     known = SeenSurface(hull.points, hull.normals, colors[tree.query(hull.points)[1]])
     whole = completed(known, symmetries, is_empty, config.gap)
-    grid = hull.closed(initial, whole.points, whole.normals, symmetries)
+    closed = hull.closed(initial, whole.points, whole.normals, symmetries)
     added = slice(len(known.points), None)
-    return Completion(grid, nothing.seen, symmetries, whole.points[added], whole.colors[added])
+    return Completion(closed, nothing.seen, symmetries, whole.points[added], whole.colors[added])
 
 
 def _empty_space(hull: ObjectHull, surface: SeenSurface, config: InitialConfig) -> EmptySpace:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.spatial
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from bigs.checks import InputError
 from bigs.data.base import Clip
@@ -20,6 +20,7 @@ from bigs.geometry.surface import (
     convex_distance,
     distance_to_planes,
     empty_grid,
+    extract_mesh,
     inlier_points,
     silhouette_around_points,
 )
@@ -28,6 +29,7 @@ from bigs.threads import side_by_side
 from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.far_side import far_side_depth
 from bigs.train.start.initial import ObjectStart
+from bigs.train.start.protrusions import protruding
 from bigs.types import MASK_VALUES
 
 # Fewer points give no surface.
@@ -81,6 +83,18 @@ def convex_surface(start: ObjectStart, config: InitialConfig) -> DistanceGrid:
 
 
 @dataclass(frozen=True)
+class ClosedSurface:
+    """A surface without gaps, and what holds its pieces."""
+
+    grid: DistanceGrid
+    held_at: np.ndarray  # [N, 3] metres: the points that it goes through, and places that masks show
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Its vertices [V, 3] and faces [F, 3]; see `extract_mesh`."""
+        return extract_mesh(self.grid, self.held_at)
+
+
+@dataclass(frozen=True)
 class ObjectHull:
     """The visual hull from the clip's frames, and the object's points in it."""
 
@@ -95,12 +109,13 @@ class ObjectHull:
         points: np.ndarray,
         normals: np.ndarray,
         symmetries: Sequence[Symmetry] = (),
-    ) -> DistanceGrid:
+    ) -> ClosedSurface:
         """The surface through points [N, 3] with normals, within their convex hull or little more.
 
         Beyond faces of that hull that no camera looked at, the object reaches as far as silhouettes ask for.
-        Beyond the others it would have hidden the points. With `symmetries`, which have added their points,
-        cameras also looked at what these make of it.
+        Beyond the others it would have hidden the points, but for parts that show beside them (see
+        `protrusions`). With `symmetries`, which have added their points, cameras also looked at what these
+        make of it.
         """
         distance = self.grid.values.ravel().copy()
         doubtful = np.flatnonzero(distance < config.surface_reach)
@@ -112,9 +127,11 @@ class ObjectHull:
         for places, facing in _carried(bounding[faces.simplices].mean(1), planes[:, :3], symmetries):
             turned &= self._frames_facing(places, facing) < least
         corners = self.grid.points()[doubtful]
+        looked_at = np.ones(len(doubtful), dtype=bool)
         if turned.any() and not turned.all():
             beyond = distance_to_planes(corners, planes[~turned]) - config.surface_margin
             behind = distance_to_planes(corners, planes[turned]) - config.surface_margin
+            looked_at = behind <= 0.0
             possible = (distance[doubtful] < 0.0) & (beyond <= 0.0)
             behind -= far_side_depth(
                 self.views, corners[possible], behind[possible], self.grid.spacing, config.surface_price
@@ -123,9 +140,31 @@ class ObjectHull:
         else:
             beyond = distance_to_planes(corners, planes) - config.surface_margin
         distance[doubtful] = np.maximum(distance[doubtful], beyond)
-        carved = DistanceGrid(distance.reshape(self.grid.values.shape), self.grid.origin, self.grid.spacing)
-        blended = blend_with_points(carved, points, normals, config.surface_reach)
-        return replace(blended, values=gaussian_filter(blended.values, config.surface_smoothing))
+        beside = doubtful[looked_at & (self.grid.values.ravel()[doubtful] < 0.0) & (beyond >= 0.0)]
+        carved, parts = self._with_protrusions(distance.reshape(self.grid.values.shape), beside)
+        blended = blend_with_points(replace(self.grid, values=carved), points, normals, config.surface_reach)
+        smooth = replace(blended, values=gaussian_filter(blended.values, config.surface_smoothing))
+        return ClosedSurface(smooth, np.concatenate([points, parts]))
+
+    def _with_protrusions(self, carved: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A carved grid [X, Y, Z] with the hull's parts that masks show beside it.
+
+        Args:
+            carved: distances.
+            beside: [N] indices of corners inside the hull that were carved away.
+
+        Returns:
+            The grid, and the corners [M, 3] that came back.
+        """
+        corners = self.grid.points()
+        # What lies deep inside shows no more than what lies around it.
+        shell = (carved < 0.0) & (carved > -2.0 * self.grid.spacing)
+        beside = beside[protruding(self.views, corners[beside], corners[shell.ravel()], self.grid.spacing)]
+        parts = np.zeros(carved.shape, dtype=bool)
+        parts.ravel()[beside] = True
+        # Their neighbours outside the hull, too, or they would end half a cell early.
+        back = parts | (binary_dilation(parts) & (self.grid.values >= 0.0))
+        return np.where(back, self.grid.values, carved), corners[beside]
 
     def _frames_facing(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """In how many frames [N] planes at places [N, 3] face the camera, whatever hides them."""

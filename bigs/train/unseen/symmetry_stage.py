@@ -15,7 +15,6 @@ from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import face_areas, frames_from_normals, point_spacing, sample_surface
 from bigs.geometry.rotations import matrix_to_quat
 from bigs.geometry.support import seen_samples
-from bigs.geometry.surface import extract_mesh
 from bigs.geometry.symmetry import SeenSurface, Symmetry, completed
 from bigs.models.canonical import CanonicalObject
 from bigs.models.object_detail import ObjectDetail, replace_gaussians, split_object
@@ -97,7 +96,7 @@ def complete_scene(
     splats, surface = scene.object_splats, scene.object_surface
     detail = splats if isinstance(splats, ObjectDetail) else split_object(canonical, 1, 0.0)
     left = weights_in_pictures(scene, evidence) >= SHOWS
-    verts, faces = extract_mesh(found.surface, np.concatenate([hull.points, found.points]))
+    verts, faces = found.surface.mesh()
     added = _far_side(canonical, left.numpy(), found, verts, faces, obj)
     for _ in range(_PASSES):
         scene.object_splats = replace_gaussians(detail, left, added)

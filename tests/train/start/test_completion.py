@@ -14,7 +14,7 @@ from limited_view import limited_view
 from bigs.data.base import Clip
 from bigs.geometry.distance import DistanceField
 from bigs.geometry.support import seen_samples
-from bigs.geometry.surface import DistanceGrid, convex_distance, extract_mesh
+from bigs.geometry.surface import DistanceGrid, convex_distance
 from bigs.geometry.symmetry import Symmetry
 from bigs.hand import HandModel
 from bigs.metrics.align import similarity_icp
@@ -25,7 +25,7 @@ from bigs.train.start import completion
 from bigs.train.start.build import build_scene
 from bigs.train.start.completion import Completion, complete
 from bigs.train.start.initial import ObjectStart, object_in_camera, smooth_object
-from bigs.train.start.visual_hull import ObjectHull, find_object_hull
+from bigs.train.start.visual_hull import ClosedSurface, ObjectHull, find_object_hull
 from bigs.types import HandObjectTrajectory, Side
 
 INITIAL = InitialConfig(surface_resolution=56)
@@ -42,8 +42,8 @@ def nothing_hides(clip: Clip) -> np.ndarray:
     return np.zeros((len(clip), clip.height, clip.width), dtype=bool)
 
 
-def score(surface: DistanceGrid, truth: HandObjectTrajectory) -> ShapeScore:
-    verts, faces = extract_mesh(surface, np.empty((0, 3)))
+def score(surface: ClosedSurface, truth: HandObjectTrajectory) -> ShapeScore:
+    verts, faces = surface.mesh()
     return similarity_icp(verts, truth.object_verts[0], faces, truth.object_faces).score
 
 
@@ -70,7 +70,7 @@ def test_hands_meet_what_a_symmetry_makes_of_the_unseen_side(
     built, plain = build_scene(*plan, CompletionConfig()), build_scene(*plan)
     assert len(built.symmetries) == len(found.symmetries) > 0 and not plain.symmetries
     solid = built.scene.object_distance.values
-    assert torch.equal(solid, DistanceField(found.surface).values)
+    assert torch.equal(solid, DistanceField(found.surface.grid).values)
     assert not torch.equal(solid, plain.scene.object_distance.values)
     # The mesh waits for the poses that the run finds.
     assert torch.equal(built.scene.object_surface.verts, plain.scene.object_surface.verts)
@@ -81,9 +81,9 @@ def test_the_far_side_is_not_sought_beyond_what_the_symmetry_carried(
 ) -> None:
     _, hull, start = one_side
     found = complete(hull, start, INITIAL, CompletionConfig())
-    inside = found.surface.points()[found.surface.values.ravel() < 0.0]
+    inside = found.surface.grid.points()[found.surface.grid.values.ravel() < 0.0]
     beyond = convex_distance(inside, np.concatenate([hull.points, found.points]))
-    assert beyond.max() <= INITIAL.surface_margin + 0.5 * found.surface.spacing
+    assert beyond.max() <= INITIAL.surface_margin + 0.5 * found.surface.grid.spacing
 
 
 def test_symmetries_found_earlier_count_if_there_are_none_now(
@@ -95,7 +95,7 @@ def test_symmetries_found_earlier_count_if_there_are_none_now(
     strict = replace(base, symmetry=replace(base.symmetry, least_support=0.999))
     again = complete(hull, start, INITIAL, strict, found.symmetries)
     assert again.symmetries == found.symmetries
-    np.testing.assert_array_equal(again.surface.values, found.surface.values)
+    np.testing.assert_array_equal(again.surface.grid.values, found.surface.grid.values)
 
 
 def test_symmetries_found_earlier_are_candidates(
@@ -118,7 +118,7 @@ def test_less_counts_as_seen_the_more_frames_must_show_it(
     one_side: tuple[Clip, ObjectHull, ObjectStart],
 ) -> None:
     _, hull, _ = one_side
-    surface = extract_mesh(hull.closed(INITIAL, hull.points, hull.normals), hull.points)
+    surface = hull.closed(INITIAL, hull.points, hull.normals).mesh()
     shares = [seen_samples(hull.views, *surface, frames, 0.006).seen.mean() for frames in (1, 3, 12)]
     assert shares[0] > shares[1] > shares[2] > 0.0
     assert seen_samples(hull.views, *surface, 3, 0.0).seen.mean() < shares[1]
@@ -131,7 +131,7 @@ def test_weak_evidence_changes_nothing(one_side: tuple[Clip, ObjectHull, ObjectS
     found = complete(hull, start, INITIAL, strict)
     plain = hull.closed(INITIAL, hull.points, hull.normals)
     assert "no strong evidence" in str(found)
-    np.testing.assert_array_equal(found.surface.values, plain.values)
+    np.testing.assert_array_equal(found.surface.grid.values, plain.grid.values)
 
 
 def test_an_object_that_was_seen_is_left(one_side: tuple[Clip, ObjectHull, ObjectStart]) -> None:
@@ -145,8 +145,8 @@ def test_the_description_counts_kinds() -> None:
 
     plane = Symmetry("plane", np.zeros(3), np.eye(3)[0])
     axis = Symmetry("axis", np.zeros(3), np.eye(3)[0])
-    grid = DistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 1.0)
-    found = Completion(grid, 0.5, [plane, axis, plane], np.zeros((7, 3)), np.zeros((7, 3)))
+    surface = ClosedSurface(DistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 1.0), np.zeros((7, 3)))
+    found = Completion(surface, 0.5, [plane, axis, plane], np.zeros((7, 3)), np.zeros((7, 3)))
     text = "2 mirror planes, 1 axis of revolution found, 7 points added where nothing was seen"
     assert str(found) == text
 

@@ -67,7 +67,7 @@ def depths(surface: DistanceGrid) -> np.ndarray:
 
 def test_the_far_side_lies_where_outlines_end() -> None:
     box = turning_box(25.0, deep=0.004)
-    front, back = depths(box.closed(CONFIG, box.points, box.normals))
+    front, back = depths(box.closed(CONFIG, box.points, box.normals).grid)
     assert front > -HALF[2] - 0.004, "space that would hide the points is part of the object"
     assert back == pytest.approx(HALF[2], abs=0.006)
 
@@ -77,14 +77,14 @@ def test_a_stray_point_does_not_stretch_it() -> None:
     points = np.concatenate([box.points, [[0.02, 0.0, 0.05]]])
     normals = np.concatenate([box.normals, [[0.0, 0.0, 1.0]]])
     alone, beside = (
-        depths(box.closed(CONFIG, *cloud)) for cloud in ((box.points, box.normals), (points, normals))
+        depths(box.closed(CONFIG, *cloud).grid) for cloud in ((box.points, box.normals), (points, normals))
     )
     np.testing.assert_allclose(beside, alone, atol=box.grid.spacing + 1e-9)
 
 
 def test_at_a_high_price_it_ends_at_the_points() -> None:
     box = turning_box(25.0, deep=0.004)
-    back = depths(box.closed(replace(CONFIG, surface_price=1.0), box.points, box.normals))[1]
+    back = depths(box.closed(replace(CONFIG, surface_price=1.0), box.points, box.normals).grid)[1]
     assert back < 0.004 - HALF[2] + CONFIG.surface_margin + box.grid.spacing
 
 
@@ -94,7 +94,7 @@ def test_the_hull_alone_is_deeper() -> None:
 
 def test_where_outlines_ask_for_nothing_it_ends_at_the_points_hull() -> None:
     box = turning_box(25.0, deep=2.0 * HALF[2])
-    surface = box.closed(CONFIG, box.points, box.normals)
+    surface = box.closed(CONFIG, box.points, box.normals).grid
     inside = surface.points()[surface.values.ravel() < 0.0]
     assert convex_distance(inside, box.points).max() <= CONFIG.surface_margin + surface.spacing
 
@@ -104,7 +104,7 @@ def test_cameras_looked_at_what_a_mirror_makes_of_a_side() -> None:
     near = Symmetry("plane", np.array([0.0, 0.0, 0.004 - HALF[2]]), np.array([0.0, 0.0, 1.0]))
     across = Symmetry("plane", np.zeros(3), np.array([1.0, 0.0, 0.0]))
     backs = [
-        depths(box.closed(CONFIG, box.points, box.normals, symmetries))[1]
+        depths(box.closed(CONFIG, box.points, box.normals, symmetries).grid)[1]
         for symmetries in ([], [across], [near], [across, near])
     ]
     # Only the first shows the back, wherever it puts it.
