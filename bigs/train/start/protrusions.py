@@ -40,12 +40,20 @@ def protruding(views: ObjectViews, places: np.ndarray, solid: np.ndarray, spacin
 def _beside(views: ObjectViews, t: int, places: np.ndarray, solid: np.ndarray, spacing: float) -> np.ndarray:
     """Which places [N] (bool) frame t shows as the object's where the known part does not show."""
     row, column, depth, inside = views.pixels(t, solid)
-    if not inside.any():
-        return np.zeros(len(places), dtype=bool)
+    shown = views.shown[t]
+    nowhere = np.zeros(len(places), dtype=bool)
+    if not inside.any() or not shown.any():
+        return nowhere
     reach = _AROUND * spacing * views.K[0, 0] / float(np.median(depth[inside])) + _EDGE
-    free = np.ones(views.shown[t].shape, dtype=bool)
+    pad = int(reach) + 1
+    around = tuple(slice(max(axis.min() - pad, 0), axis.max() + pad + 1) for axis in np.nonzero(shown))
+    free = np.ones(shown.shape, dtype=bool)
     free[row[inside], column[inside]] = False
-    unexplained = views.shown[t] & (distance_transform_edt(free) > reach)
-    unexplained = binary_opening(unexplained, np.ones((_THIN, _THIN)))
+    if free[around].all():
+        return nowhere
+    unexplained = np.zeros(shown.shape, dtype=bool)
+    unexplained[around] = binary_opening(
+        shown[around] & (distance_transform_edt(free[around]) > reach), np.ones((_THIN, _THIN))
+    )
     row, column, _, inside = views.pixels(t, places)
     return inside & unexplained[row, column]

@@ -127,11 +127,9 @@ class ObjectHull:
         for places, facing in _carried(bounding[faces.simplices].mean(1), planes[:, :3], symmetries):
             turned &= self._frames_facing(places, facing) < least
         corners = self.grid.points()[doubtful]
-        looked_at = np.ones(len(doubtful), dtype=bool)
         if turned.any() and not turned.all():
             beyond = distance_to_planes(corners, planes[~turned]) - config.surface_margin
             behind = distance_to_planes(corners, planes[turned]) - config.surface_margin
-            looked_at = behind <= 0.0
             possible = (distance[doubtful] < 0.0) & (beyond <= 0.0)
             behind -= far_side_depth(
                 self.views, corners[possible], behind[possible], self.grid.spacing, config.surface_price
@@ -140,18 +138,13 @@ class ObjectHull:
         else:
             beyond = distance_to_planes(corners, planes) - config.surface_margin
         distance[doubtful] = np.maximum(distance[doubtful], beyond)
-        beside = doubtful[looked_at & (self.grid.values.ravel()[doubtful] < 0.0) & (beyond >= 0.0)]
-        carved, parts = self._with_protrusions(distance.reshape(self.grid.values.shape), beside)
+        carved, parts = self._with_protrusions(distance.reshape(self.grid.values.shape))
         blended = blend_with_points(replace(self.grid, values=carved), points, normals, config.surface_reach)
         smooth = replace(blended, values=gaussian_filter(blended.values, config.surface_smoothing))
         return ClosedSurface(smooth, np.concatenate([points, parts]))
 
-    def _with_protrusions(self, carved: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A carved grid [X, Y, Z] with the hull's parts that masks show beside it.
-
-        Args:
-            carved: distances.
-            beside: [N] indices of corners inside the hull that were carved away.
+    def _with_protrusions(self, carved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A carved grid [X, Y, Z] with the parts of the hull that masks show beside it.
 
         Returns:
             The grid, and the corners [M, 3] that came back.
@@ -159,6 +152,7 @@ class ObjectHull:
         corners = self.grid.points()
         # What lies deep inside shows no more than what lies around it.
         shell = (carved < 0.0) & (carved > -2.0 * self.grid.spacing)
+        beside = np.flatnonzero((self.grid.values < 0.0) & (carved >= 0.0))
         beside = beside[protruding(self.views, corners[beside], corners[shell.ravel()], self.grid.spacing)]
         parts = np.zeros(carved.shape, dtype=bool)
         parts.ravel()[beside] = True

@@ -19,13 +19,12 @@ from bigs.train.start.visual_hull import ObjectHull
 FRAMES = 24
 K = np.array([[700.0, 0.0, 80.0], [0.0, 700.0, 80.0], [0.0, 0.0, 1.0]])
 BODY = trimesh.creation.box((0.05, 0.06, 0.05))
-# Its middle; as long as it is, it has to be told by more than the outline's edge.
-TIP = np.array([0.045, 0.0, 0.0])
 
 
 def bar() -> trimesh.Trimesh:
-    """Stands out of the body's side, without a point on it."""
-    return trimesh.creation.box((0.05, 0.008, 0.008), trimesh.transformations.translation_matrix(TIP))
+    """Stands out from the body's side, without a point on it, and hangs together with it by nothing."""
+    place = trimesh.transformations.translation_matrix([0.051, 0.0, 0.0])
+    return trimesh.creation.box((0.038, 0.008, 0.008), place)
 
 
 def turning(with_bar: range) -> ObjectHull:
