@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.spatial
 import skimage.draw
 import trimesh
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from bigs.geometry.coverage import ObjectViews
@@ -22,7 +25,7 @@ BODY = trimesh.creation.box((0.05, 0.06, 0.05))
 
 
 def bar() -> trimesh.Trimesh:
-    """Stands out from the body's side, without a point on it, and hangs together with it by nothing."""
+    """Stands out from the body's side, not joined to it, and without a point on it."""
     place = trimesh.transformations.translation_matrix([0.051, 0.0, 0.0])
     return trimesh.creation.box((0.038, 0.008, 0.008), place)
 
@@ -85,3 +88,49 @@ def test_what_shows_beside_is_told_from_what_lies_before() -> None:
     assert found.tolist() == [True, False, False, False]
     assert not protruding(hull.views, places, solid[:0], hull.grid.spacing).any()
     assert protruding(hull.views, places[:0], solid, hull.grid.spacing).shape == (0,)
+
+
+def still(shown: np.ndarray) -> ObjectViews:
+    """Three frames of a mask [H, W] and one pose."""
+    return ObjectViews(
+        np.repeat(shown[None], 3, axis=0),
+        K,
+        np.repeat(np.eye(3)[None], 3, axis=0),
+        np.tile([0.0, 0.0, 0.7], (3, 1)),
+    )
+
+
+def test_a_frame_that_does_not_show_the_known_part_says_nothing() -> None:
+    """Its pose puts that part beside the mask or out of the picture, or there is no mask."""
+    mask = turning(range(0)).views.shown[0]
+    place = np.zeros((1, 3))
+    for shown, x in ((mask, 0.075), (mask, 5.0), (np.zeros_like(mask), 0.0)):
+        assert not protruding(still(shown), place, np.array([[x, 0.0, 0.0]]), 0.0025).any()
+
+
+def test_a_coarse_grid_has_no_holes() -> None:
+    steps = 0.008 * np.arange(-3, 4)
+    solid = np.stack(np.meshgrid(steps, steps, [0.0]), axis=-1).reshape(-1, 3)
+    views = still(turning(range(0)).views.shown[0])
+    assert not protruding(views, np.array([[0.004, 0.004, 0.0]]), solid, 0.008).any()
+
+
+def test_outlines_that_are_off_ask_for_nothing() -> None:
+    hull = turning(range(0))
+    rough = np.stack([binary_dilation(mask, iterations=5) for mask in hull.views.shown])
+    views = replace(hull.views, shown=rough)
+    outside = VisualHull(np.stack([silhouette_distance(mask) for mask in rough]), *views.poses)
+    distance = outside.distance(hull.grid.points()).reshape(hull.grid.values.shape)
+    hull = replace(hull, grid=replace(hull.grid, values=distance), views=views)
+    assert len(hull.closed(InitialConfig(), hull.points, hull.normals).held_at) == len(hull.points)
+
+
+def test_a_part_shows_beside_a_body_that_a_hand_hides() -> None:
+    """Its mask is not the body's, and what lies out of the picture is in no mask."""
+    body = np.array([[x, y, 0.0] for x in np.arange(-20, 1) / 1000 for y in np.arange(-20, 21) / 1000])
+    mask = np.zeros((160, 160), dtype=bool)
+    mask[:, 82:120] = True  # right of the body, which ends at column 80
+    places = np.array([[0.02, 0.0, 0.0], [0.0025, 0.0, 0.0]])
+    assert protruding(still(mask), places, body, 0.001).tolist() == [True, False]
+    outside = np.array([[5.0, 0.0, 0.0]])
+    assert not protruding(still(np.ones_like(mask)), outside, body, 0.001).any()
