@@ -189,9 +189,7 @@ def fit(
         if isinstance(stage, ScaleSearchStage):
             size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {size.text()}"})
-            report.facts["object size"] = (
-                f"last corrected by a factor of {size.text()}, by where hands touch it"
-            )
+            report.facts["object size"] = f"last searched, by where hands touch it: x {size.text()}"
         elif isinstance(stage, GraspStage):
             grasps = find_grasps(scene, stage, sources.meeting, sources.mismatch(stage))
             for side, found in grasps.items():
@@ -233,6 +231,10 @@ def fit(
         show(stage.name, None)
     watch.begin("object mesh")
     scene.requires_grad_(False)
+    if "object size" in report.facts:
+        report.facts["object size"] += (
+            f"; in the end {scene.object_poses.log_scale.exp():.3f} of the estimate's"
+        )
     left_out = report.left_out(1.0 - targets.cropped())
     if left_out:
         report.facts["left out"] = left_out

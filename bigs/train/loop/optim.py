@@ -102,11 +102,15 @@ def make_optimizer(
 ) -> FrameAdam:
     """Adam over the listed groups; everything else is set not to require a gradient.
 
-    `betas` and `frame_moments` are as in `OptimizeStage`.
+    `betas` and `frame_moments` are as in `OptimizeStage`. Without a grasp the object's size stays as it is:
+    no picture tells it then, and Adam would follow rounding.
     """
     scene.requires_grad_(False)
+    held = any(grasps.count for grasps in scene.grasps.values())
     groups = []
     for name, lr in lrs.items():
+        if name == "object.scale" and not held:
+            continue
         parameters = group_parameters(scene, name)
         for parameter in parameters:
             parameter.requires_grad_(True)

@@ -74,7 +74,8 @@ _HANDS_FINE = OptimizeStage(
     image_size=160,
     stop_patience=_SETTLED,
 )
-# Grasps are known: what all frames of one agree on moves together.
+# Grasps are known: what all frames of one agree on moves together. A grasp seen from several sides also tells
+# how large the hand is beside the object, so that the object's size is learned along with it.
 _GRASPED_RATES = {
     "hand.orient": 0.006,
     "hand.pose": 0.008,
@@ -85,6 +86,7 @@ _GRASPED_RATES = {
     "hand.grasp_orient": 0.006,
     "hand.grasp_pose": 0.008,
     "hand.grasp_position": 0.001,
+    "object.scale": 0.003,
 }
 _GRASPED = OptimizeStage(
     name="grasped",
@@ -195,6 +197,7 @@ _JOINT = OptimizeStage(
         "hand.grasp_orient": 0.003,
         "hand.grasp_pose": 0.006,
         "hand.grasp_position": 0.0005,
+        "object.scale": 0.0005,
         "hand.color": 0.03,
         "hand.shift": 5e-5,
         "hand.size": 0.005,

@@ -68,12 +68,12 @@ def test_an_unknown_group_is_named(both_hands: dict[Side, HandModel]) -> None:
 
 def test_only_listed_groups_require_gradients(both_hands: dict[Side, HandModel]) -> None:
     scene = cube_scene(both_hands)
-    make_optimizer(scene, {"hand.ray": 0.1, "object.scale": 0.2, "scene.light": 0.3}, BETAS)
+    make_optimizer(scene, {"hand.ray": 0.1, "object.ray": 0.2, "scene.light": 0.3}, BETAS)
     trainable = {name for name, p in scene.named_parameters() if p.requires_grad}
     assert trainable == {
         "hand_poses.right.position.ray",
         "hand_poses.left.position.ray",
-        "object_poses.log_scale",
+        "object_poses.position.ray",
         "lighting.clip",
     }
 

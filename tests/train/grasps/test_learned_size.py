@@ -1,0 +1,95 @@
+"""The object's size from how large hands look in their grasps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from toy_scenes import cube_scene
+
+from bigs.fused.outline import covered_shares
+from bigs.geometry.rotations import axis_angle_to_matrix
+from bigs.hand import builtin_hand, mirror_rotation
+from bigs.models.scene import Scene
+from bigs.raster import RasterSettings
+from bigs.train.grasps.find import find_grasps
+from bigs.train.loop.run_stage import run_stage
+from bigs.train.loop.step import Evidence
+from bigs.train.loop.targets import Targets
+from bigs.train.plan.config import GraspStage, OptimizeStage
+from bigs.train.plan.presets import PRESETS
+
+FRAMES = 8
+STAGE = OptimizeStage(
+    name="size",
+    step="single-subject",
+    steps=40,
+    lrs={"object.scale": 0.004, "hand.grasp_position": 0.001},
+    weights={"silhouette": 1.0},
+    final_lr=0.1,
+)
+
+
+def held_and_turned() -> Scene:
+    """The cube turns by 60 degrees about the vertical, and hands that hold it turn with it."""
+    scene = cube_scene({side: builtin_hand(side) for side in ("right", "left")}, frames=FRAMES)
+    turn = torch.linspace(0, math.pi / 3, FRAMES)
+    rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
+    with torch.no_grad():
+        scene.object_poses.base_orient.copy_(rotations)
+        centers = scene.at(torch.arange(FRAMES)).object.centers
+        for side, poses in scene.hand_poses.items():
+            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
+            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
+            poses.position.restart(centers + away)
+    return scene
+
+
+@torch.no_grad()
+def outlines(scene: Scene) -> Evidence:
+    """The hands' true outlines, as large as the clip's images; nothing hides anything."""
+    posed = scene.at(torch.arange(FRAMES))
+    size = (scene.width, scene.height)
+    shares = {
+        side: covered_shares(posed.verts(side), scene.hand_model(side).faces, scene.K, *size)
+        for side in scene.sides
+    }
+    nothing = torch.zeros(FRAMES, scene.height, scene.width)
+    targets = Targets(
+        nothing[..., None].repeat(1, 1, 1, 3), shares | {"object": nothing}, nothing, scene.K, *size
+    )
+    return Evidence(targets, {}, {}, {}, "surface", RasterSettings())
+
+
+@pytest.mark.parametrize("wrong", [0.96, 1.04])
+def test_a_grasp_seen_from_several_sides_tells_it(wrong: float) -> None:
+    scene = held_and_turned()
+    evidence = outlines(scene)
+    find_grasps(scene, GraspStage(slack=0.0), {side: torch.ones(FRAMES) for side in scene.sides})
+    with torch.no_grad():
+        # Hands go with the object that holds them.
+        scene.object_poses.log_scale.fill_(math.log(wrong))
+    run_stage(scene, STAGE, evidence, 0)
+    assert float(scene.object_poses.log_scale.detach().exp()) == pytest.approx(1.0, abs=0.008)
+
+
+def test_without_a_grasp_it_stays() -> None:
+    """Adam takes a step of full size along a gradient of mere rounding."""
+    scene = held_and_turned()
+    evidence = outlines(scene)
+    with torch.no_grad():
+        scene.object_poses.log_scale.fill_(math.log(0.96))
+        for poses in scene.hand_poses.values():
+            poses.pose.fill_(0.1)
+    before = scene.object_poses.log_scale.clone()
+    run_stage(scene, STAGE, evidence, 0)
+    assert torch.equal(scene.object_poses.log_scale, before)
+
+
+@pytest.mark.parametrize("name", ["fast", "full", "demo"])
+def test_plans_learn_it_while_hands_hold_the_object(name: str) -> None:
+    learned = {
+        s.name for s in PRESETS[name].stages if isinstance(s, OptimizeStage) and "object.scale" in s.lrs
+    }
+    assert learned == {"grasped", "contact", "joint"}
