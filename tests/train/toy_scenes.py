@@ -10,8 +10,9 @@ import trimesh
 
 from bigs.fields.triplane import TriplaneConfig
 from bigs.geometry.distance import DistanceField
+from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.geometry.surface import empty_grid
-from bigs.hand import HandModel, mirror_points
+from bigs.hand import HandModel, builtin_hand, mirror_points, mirror_rotation
 from bigs.models.hand_splats import HandSplats, HandSplatsConfig
 from bigs.models.lighting import Lighting
 from bigs.models.object_splats import ObjectSplats, ObjectSplatsConfig
@@ -71,3 +72,23 @@ def cube_scene(models: Mapping[Side, HandModel], size: float = 1.0, frames: int 
         object_distance=DistanceField(grid),
         lighting=Lighting(("right", "left", "object"), frames),
     )
+
+
+def turning_scene(wander: float = 0.0, frames: int = 24, turn: float = 2.0) -> Scene:
+    """The cube turns by `turn` radians about the camera's vertical, and hands that hold it turn with it.
+
+    The hands' estimates wander by `wander` metres.
+    """
+    scene = cube_scene({side: builtin_hand(side) for side in ("right", "left")}, frames=frames)
+    angle = torch.linspace(0, turn, frames)
+    rotations = axis_angle_to_matrix(torch.stack([0 * angle, angle, 0 * angle], -1))
+    noise = wander * torch.randn(frames, 3, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        scene.object_poses.base_orient.copy_(rotations)
+        centers = scene.at(torch.arange(frames)).object.centers
+        for side in scene.sides:
+            poses = scene.hand_poses[side]
+            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
+            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
+            poses.position.restart(centers + away + noise)
+    return scene

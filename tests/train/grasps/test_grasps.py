@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_scenes import cube_scene
+from toy_scenes import turning_scene
 
 from bigs.checks import InputError
 from bigs.geometry.rotations import axis_angle_to_matrix, robust_mean_rotation, rotation_angle
-from bigs.hand import builtin_hand, mirror_rotation
+from bigs.hand import mirror_rotation
 from bigs.models.poses import HandFrames, ObjectFrames
 from bigs.models.scene import Scene
 from bigs.train.check_plan import check_plan
@@ -27,23 +27,6 @@ from bigs.types import Side
 
 STAGE = GraspStage()
 FRAMES = 24
-
-
-def turning_scene(wander: float = 0.0) -> Scene:
-    """The held cube turning about the camera's vertical; the hands' estimates wander by `wander` metres."""
-    scene = cube_scene({side: builtin_hand(side) for side in ("right", "left")}, frames=FRAMES)
-    turn = torch.linspace(0, 2.0, FRAMES)
-    rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
-    noise = wander * torch.randn(FRAMES, 3, generator=torch.Generator().manual_seed(1))
-    with torch.no_grad():
-        scene.object_poses.base_orient.copy_(rotations)
-        centers = scene.at(torch.arange(FRAMES)).object.centers
-        for side in scene.sides:
-            poses = scene.hand_poses[side]
-            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
-            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
-            poses.position.restart(centers + away + noise)
-    return scene
 
 
 def turning_copy(scene: Scene) -> Scene:

@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_scenes import cube_scene
+from toy_scenes import turning_scene
 
 from bigs.fused.outline import covered_shares
-from bigs.geometry.rotations import axis_angle_to_matrix
-from bigs.hand import builtin_hand, mirror_rotation
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
 from bigs.train.grasps.find import find_grasps
@@ -32,21 +30,6 @@ STAGE = OptimizeStage(
 )
 
 
-def held_and_turned() -> Scene:
-    """The cube turns by 60 degrees about the vertical, and hands that hold it turn with it."""
-    scene = cube_scene({side: builtin_hand(side) for side in ("right", "left")}, frames=FRAMES)
-    turn = torch.linspace(0, math.pi / 3, FRAMES)
-    rotations = axis_angle_to_matrix(torch.stack([0 * turn, turn, 0 * turn], -1))
-    with torch.no_grad():
-        scene.object_poses.base_orient.copy_(rotations)
-        centers = scene.at(torch.arange(FRAMES)).object.centers
-        for side, poses in scene.hand_poses.items():
-            away = (rotations @ (poses.position(torch.tensor([0])) - centers[:1])[0][..., None])[..., 0]
-            poses.base_orient.copy_(mirror_rotation(rotations) if side == "left" else rotations)
-            poses.position.restart(centers + away)
-    return scene
-
-
 @torch.no_grad()
 def outlines(scene: Scene) -> Evidence:
     """The hands' true outlines, as large as the clip's images; nothing hides anything."""
@@ -65,7 +48,7 @@ def outlines(scene: Scene) -> Evidence:
 
 @pytest.mark.parametrize("wrong", [0.96, 1.04])
 def test_a_grasp_seen_from_several_sides_tells_it(wrong: float) -> None:
-    scene = held_and_turned()
+    scene = turning_scene(frames=FRAMES, turn=math.pi / 3)
     evidence = outlines(scene)
     find_grasps(scene, GraspStage(slack=0.0), {side: torch.ones(FRAMES) for side in scene.sides})
     with torch.no_grad():
@@ -77,7 +60,7 @@ def test_a_grasp_seen_from_several_sides_tells_it(wrong: float) -> None:
 
 def test_without_a_grasp_it_stays() -> None:
     """The object's picture is the same at any size, and Adam takes full steps along mere rounding."""
-    scene = held_and_turned()
+    scene = turning_scene(frames=FRAMES, turn=math.pi / 3)
     pictured = replace(STAGE, step="interacting-subjects", weights={"image": 1.0})
     before = scene.object_poses.log_scale.clone()
     run_stage(scene, pictured, outlines(scene), 0)
