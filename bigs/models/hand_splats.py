@@ -16,7 +16,7 @@ from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.hand import HandModel
 from bigs.hand.lbs import pose_corrective
-from bigs.models.canonical import CanonicalHand
+from bigs.models.canonical import CanonicalHand, below_surface
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,8 @@ class HandSplats(nn.Module):
         normals = vertex_normals(points, faces)
         spacing = point_spacing(points)
         sigma = config.scale_per_spacing * spacing
-        # A Gaussian on the surface reaches past the silhouette, so its centre is moved inwards by as much.
-        inset = config.flatness * sigma[:, None] * normals
-        self.register_buffer("base_points", float32(points - inset), persistent=False)
+        centres = below_surface(points, normals, config.flatness * sigma)
+        self.register_buffer("base_points", float32(centres), persistent=False)
         self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)
         if model.has_posedirs:
             self.register_buffer("posedirs", carry(model.posedirs), persistent=False)

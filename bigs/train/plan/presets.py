@@ -197,7 +197,7 @@ _JOINT = OptimizeStage(
         "hand.grasp_orient": 0.003,
         "hand.grasp_pose": 0.006,
         "hand.grasp_position": 0.0005,
-        "object.scale": 0.0005,
+        "object.scale": 0.001,
         "hand.color": 0.03,
         "hand.shift": 5e-5,
         "hand.size": 0.005,
