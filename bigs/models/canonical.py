@@ -4,26 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 from torch import Tensor
-
-# A layer of Gaussians covers pictures to so many of its standard deviations above its centres: lines of sight
-# that graze it pass many, and each reaches further on screen than in space (`RasterSettings.eps2d`).
-_REACH = 3.0
-
-
-def below_surface(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray) -> np.ndarray:
-    """Where centres [N, 3] lie if a layer of Gaussians is to cover what the surface covers.
-
-    On the surface itself they would draw a subject wider than it is, and poses would make up for it: hands
-    would be drawn as too large, and put too far away, beside an object that need not shrink with them.
-
-    Args:
-        points: [N, 3] of the surface.
-        normals: [N, 3] unit, outward.
-        thickness: [N] standard deviations across the surface.
-    """
-    return points - _REACH * thickness[:, None] * normals
 
 
 class CanonicalHand(NamedTuple):

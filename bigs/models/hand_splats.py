@@ -16,7 +16,7 @@ from bigs.geometry.mesh import frames_from_normals, midpoint_subdivision, point_
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
 from bigs.hand import HandModel
 from bigs.hand.lbs import pose_corrective
-from bigs.models.canonical import CanonicalHand, below_surface
+from bigs.models.canonical import CanonicalHand
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,11 @@ class HandSplatsConfig:
     # The mean colour at the start; None takes what the pictures show of the hands. A stage may change it.
     color: tuple[float, float, float] | None = None
 
+
+# A layer of Gaussians covers pictures to so many of its standard deviations above its centres: lines of sight
+# that graze it pass many. On the mesh itself they would draw the hand wider than it is, and the hand would be
+# put too far away to make up for it. (The object's need not follow a mesh.)
+_REACH = 3.0
 
 # The mean colour of light skin under white light, where nothing shows the hands.
 _SKIN = (0.7, 0.55, 0.45)
@@ -86,8 +91,8 @@ class HandSplats(nn.Module):
         normals = vertex_normals(points, faces)
         spacing = point_spacing(points)
         sigma = config.scale_per_spacing * spacing
-        centres = below_surface(points, normals, config.flatness * sigma)
-        self.register_buffer("base_points", float32(centres), persistent=False)
+        inset = _REACH * config.flatness * sigma[:, None] * normals
+        self.register_buffer("base_points", float32(points - inset), persistent=False)
         self.register_buffer("shapedirs", carry(model.shapedirs), persistent=False)
         if model.has_posedirs:
             self.register_buffer("posedirs", carry(model.posedirs), persistent=False)

@@ -14,7 +14,7 @@ from bigs.fields.triplane import Triplane, TriplaneConfig
 from bigs.geometry.arrays import float32
 from bigs.geometry.mesh import frames_from_normals, point_spacing
 from bigs.geometry.rotations import matrix_to_quat, quat_multiply
-from bigs.models.canonical import CanonicalObject, below_surface
+from bigs.models.canonical import CanonicalObject
 from bigs.models.lighting import N_PARTS
 from bigs.models.poses import ObjectFrames
 from bigs.models.posing import object_part, pose_parts
@@ -66,8 +66,9 @@ class ObjectSplats(nn.Module):
         self.config = config
         sigma = config.scale_per_spacing * point_spacing(points)
         flatness = 1.0 if config.isotropic else config.flatness
+        inset = flatness * sigma[:, None] * normals
         # Buffers, not constants: densification changes their length, so a checkpoint must carry them.
-        self.register_buffer("base_points", float32(below_surface(points, normals, flatness * sigma)))
+        self.register_buffer("base_points", float32(points - inset))
         self.register_buffer("normals", float32(normals))
         self.register_buffer("base_quats", matrix_to_quat(float32(frames_from_normals(normals))))
         scales = sigma[:, None] * np.array([1.0, 1.0, flatness])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +30,3 @@ class RasterSettings:
     float64 has one of degree 12, and only takes 5 here."""
     antialiased: bool = False
     """Scale opacities by what `eps2d` added to the area (Mip-Splatting): thin ones do not grow brighter."""
-
-    def reduced(self, scale: float) -> RasterSettings:
-        """The settings for pictures whose sides are reduced to `scale` of them, in (0, 1], by taking means.
-
-        On screen `eps2d` shrinks with everything else. A pixel is the mean over the area of several, which
-        widens what it shows by the variance of that area, 1/12 px², less that of the area of one.
-        """
-        return replace(self, eps2d=self.eps2d * scale**2 + (1.0 - scale**2) / 12.0)

@@ -26,7 +26,7 @@ def test_a_fresh_object_is_its_start_less_the_inset() -> None:
     spacing = torch.as_tensor(point_spacing(OBJECT_RADIUS * obj.normals.numpy()), dtype=torch.float32)
     torch.testing.assert_close(obj.scales[:, 0], OBJECT.scale_per_spacing * spacing)
     torch.testing.assert_close(obj.scales[:, 2], OBJECT.flatness * obj.scales[:, 1])
-    outer = obj.means + 3.0 * obj.scales[:, 2:] * obj.normals
+    outer = obj.means + obj.scales[:, 2:] * obj.normals
     torch.testing.assert_close(outer, OBJECT_RADIUS * obj.normals, atol=1e-7, rtol=0)
     torch.testing.assert_close(third_axis(obj.quats), obj.normals, atol=1e-6, rtol=0)
     torch.testing.assert_close(obj.colors, 0.5 + 0.4 * obj.normals, atol=1e-6, rtol=0)

@@ -78,14 +78,13 @@ class EvidenceSource:
     ) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets.at(stage.image_size)
-        scale = min(1.0, float(targets.K[0, 0] / self.clip.K[0, 0]))
         return Evidence(
             targets,
             self.touching(),
             {side: impossible_turns(self.scene.hand_model(side)) for side in self.scene.sides},
             {side: bends(self.scene.hand_model(side)) for side in self.scene.sides},
             self.config.contact,
-            self.config.raster.reduced(scale),
+            self.config.raster,
             self.perceptual,
             self.denoiser,
         )

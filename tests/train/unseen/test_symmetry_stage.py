@@ -107,7 +107,7 @@ def test_hands_meet_the_surface_that_is_completed_later(
     assert completed[1].facts["object completed"]
     verts = completed[0].object_surface.verts
     off, hull_off = (scene.object_distance(verts).abs().mean() for scene in (completed[0], plain[0]))
-    assert off < 1e-3 and hull_off > 2.0 * off
+    assert off < 1e-3 and hull_off > 1.5 * off
 
 
 def test_what_is_added_shows_in_no_frame(
@@ -122,7 +122,7 @@ def test_what_is_added_shows_in_no_frame(
     evidence = sources.evidence(replace(SMOKE.stages[0], image_size=240))
     known = plain[0].object_splats.base_points
     new = ~(completed[0].object_splats.base_points[:, None] == known[None]).all(-1).any(1)
-    assert int(new.sum()) > 50
+    assert int(new.sum()) > 30
     assert float(weights_in_pictures(completed[0], evidence)[new].max()) < 0.05
     everything = torch.arange(len(clip))
     errors = [image_error(scene, evidence, scene.entities, everything) for scene in (plain[0], completed[0])]
