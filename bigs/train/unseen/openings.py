@@ -33,6 +33,9 @@ _MARGIN = 2
 _DARK = 0.02
 # How a vertex' brightness varies is the median of so many vertices around it.
 _AROUND = 32
+# Brightness varies as it does on surface that is there up to this share of what was measured. A plain object has
+# few measured points, and its sides vary as much as half of them.
+_USUAL = 0.95
 # Frames that must show a vertex before its brightness says anything.
 _LEAST_SHOWN = 5
 
@@ -73,9 +76,10 @@ def openings(
     if area[proven].sum() < config.area:
         return gripped
     varies = _variation(scene, evidence, views, verts, faces)
-    usual = np.nanmedian(varies[~unmeasured]) if np.isfinite(varies[~unmeasured]).any() else np.inf
+    there = varies[~unmeasured]
+    most = np.nanquantile(there, _USUAL) if np.isfinite(there).any() else np.inf
     # Comparisons with what is not known are false.
-    open_ = proven | (unmeasured & (varies > usual))
+    open_ = proven | (unmeasured & (varies > most))
     return gripped | _with_proof(faces, open_, area * proven, config.area)
 
 

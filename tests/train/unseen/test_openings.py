@@ -107,6 +107,21 @@ def test_it_goes_on_where_brightness_varies_but_not_over_measured_points(scene: 
     assert not found[still].any() and not found[~on_plate(scene)].any()
 
 
+def test_it_does_not_go_on_where_brightness_varies_as_on_some_measured_surface(scene: Scene) -> None:
+    """A one-colour pitcher lost its sides: half of its few measured points vary less than those do."""
+    clip, wild = evidence(scene, flicker=0.4), evidence(scene, flicker=0.8)
+    verts = scene.object_surface.verts.numpy().astype(np.float64)
+    strip = verts[on_plate(scene) & (verts[:, 0] < -0.1)]
+    # Most of the measured strip is steady; a quarter of what is in view of it varies more than anything else.
+    clip.targets.images[:, :, :22] = wild.targets.images[:, :, :22]
+    clip.targets.images[:, :, :10] = 0.5
+    measured = cube_points(scene)
+    measured = measured._replace(points=np.concatenate([measured.points, strip]))
+    found = openings(scene, scene.object_surface, clip, measured, OpeningConfig())
+    before_hand = behind_plate(scene, clip)
+    assert found[before_hand].any() and not found[~before_hand].any()
+
+
 @pytest.mark.parametrize("change", ["frames", "share", "area", "depth", "measured"])
 def test_each_setting_decides(scene: Scene, change: str) -> None:
     clip = evidence(scene, flicker=0.0)
