@@ -49,7 +49,7 @@ class HandSplatsConfig:
 
 # A layer of Gaussians covers pictures to so many of its standard deviations above its centres: lines of sight
 # that graze it pass many. On the mesh itself they would draw the hand wider than it is, and the hand would be
-# put too far away to make up for it. (The object's need not follow a mesh.)
+# put too far away to make up for it. (The object's follow no mesh.)
 _REACH = 3.0
 
 # The mean colour of light skin under white light, where nothing shows the hands.

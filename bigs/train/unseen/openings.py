@@ -33,8 +33,8 @@ _MARGIN = 2
 _DARK = 0.02
 # How a vertex' brightness varies is the median of so many vertices around it.
 _AROUND = 32
-# Brightness varies as it does on surface that is there up to this share of what was measured. A plain object has
-# few measured points, and its sides vary as much as half of them.
+# Up to this share of what was measured, brightness varies as it does on surface that is there. A plain object
+# has few measured points, and its sides vary more than half of them.
 _USUAL = 0.95
 # Frames that must show a vertex before its brightness says anything.
 _LEAST_SHOWN = 5
