@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-import trimesh
 from posed_hands import pose_hand
 from small_scene import HAND, hand_model
 
 from bigs.fused.outline import covered_shares
+from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.models.hand_splats import HandSplats
 from bigs.models.poses import HandFrames
 from bigs.raster import rasterization
@@ -26,8 +26,8 @@ def camera(decimetre: float) -> tuple[torch.Tensor, int]:
 def hand_areas(subdivisions: int, turn: float, decimetre: float) -> float:
     """What its Gaussians cover of a picture, relative to what its mesh covers."""
     model, betas = hand_model(), torch.zeros(10)
-    turned = torch.tensor(trimesh.transformations.rotation_matrix(turn, [0.0, 1.0, 0.0])[:3, :3]).float()
-    pose = HandFrames(turned[None], torch.eye(3).expand(1, 15, 3, 3), torch.tensor([[0.0, 0.0, DEPTH]]))
+    turned = axis_angle_to_matrix(torch.tensor([[0.0, turn, 0.0]]))
+    pose = HandFrames(turned, torch.eye(3).expand(1, 15, 3, 3), torch.tensor([[0.0, 0.0, DEPTH]]))
     torch.manual_seed(0)
     splats = HandSplats(model, replace(HAND, subdivisions=subdivisions))
     gaussians = pose_hand(model, splats(), betas, pose, "right")
