@@ -4,8 +4,9 @@ Masks label a sleeve as background, yet it hides a hand as an object does. With 
 background is the same in every frame, so whatever differs from it, and is no shadow on it, is an unknown
 occluder. What a pixel shows most of the time need not be the background: it may be a forearm that hardly
 moves. Where a pixel shows two colours, the one that the clip's occluders have elsewhere belongs to an
-occluder. A camera that shakes is held still first (see `shake`). Before a background that moves otherwise
-only arms are looked for (see `arms`), and masks that were lost: what they showed may still be there.
+occluder, and where arms may always be and nothing but their colours shows, no frame shows the background. A
+camera that shakes is held still first (see `shake`). Before a background that moves otherwise only arms are
+looked for (see `arms`), and masks that were lost: what they showed may still be there.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ _SIZE = 320
 _CONTESTED_SHARE = 0.05
 # Rounds of counting colours of occluders and background, and of deciding.
 _ROUNDS = 8
+# An arm may hide a pixel in the whole clip if it reaches it in this share of frames; estimates err in some.
+_ALWAYS = 0.75
 # How far, in compared pixels, a subject may have moved beyond where the frames around show it.
 _MOVED = 10
 # Half the width, in compared pixels, of holes that are closed.
@@ -70,11 +73,12 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluder
     labels = np.stack(side_by_side(lambda t: clip.mask(t)[::step, ::step], frames))
     background = labels == 0
     K = np.diag([1.0 / step, 1.0 / step, 1.0]) @ clip.K
-    reach, cuffs = arm_reach(joints, K, labels.shape), cuff_reach(joints, K, labels.shape)
-    differs, moving = _differing(images, background, cuffs), None
+    reach = arm_reach(joints, K, labels.shape)
+    near = _Near(reach, cuff_reach(joints, K, labels.shape))
+    differs, moving = _differing(images, background, near), None
     if _moves(differs, background, reach):
         moving = "turns, as the camera does"
-        differs = _differing_before(steady_view(images, background, K), images, background, cuffs)
+        differs = _differing_before(steady_view(images, background, K), images, background, near)
     if _moves(differs, background, reach):
         moving = "moves, so that what hides hands is known only where arms may be"
         unknown = _lost(labels) | _whole(arms(images, background, reach, joints, K), background)
@@ -86,32 +90,59 @@ def unknown_occluders(clip: Clip, joints: Mapping[Side, np.ndarray]) -> Occluder
     return Occluders(whole, moving)
 
 
-def _differing(images: np.ndarray, background: np.ndarray, cuffs: np.ndarray) -> np.ndarray:
+class _Near(NamedTuple):
+    """Where arms may be; bool [T, H, W]."""
+
+    arms: np.ndarray
+    cuffs: np.ndarray  # where a sleeve may look like a shadow
+
+
+class _Still(NamedTuple):
+    """The background that stands still."""
+
+    colors: np.ndarray  # [H, W, 3] in [0, 1]
+    hidden: np.ndarray  # [H, W] bool, where hardly a frame shows it, and `colors` are an occluder's
+    odds: np.ndarray  # by the colour's cell, logarithm: how much more often it is an occluder's
+
+
+def _differing(images: np.ndarray, background: np.ndarray, near: _Near) -> np.ndarray:
     """Where the background [T, H, W] of images [T, H, W, 3] is not what stands still: bool.
 
-    Shadows on it only count in the `cuffs` [T, H, W] of arms, where a sleeve may look like one.
+    Shadows on it only count in cuffs.
     """
-    still = _still_background(_looks(images, background))
+    still = _still_background(_looks(images, background), _always(near.arms, background))
     # A frame at a time: the whole clip in floats is large.
-    frames = zip(images, cuffs, strict=True)
-    return background & np.stack([_unlike(_floats(image), still, near) for image, near in frames])
+    frames = zip(images, near.cuffs, strict=True)
+    return background & np.stack([_unlike(_floats(image), still, cuffs) for image, cuffs in frames])
 
 
 def _differing_before(
-    view: SteadyView, images: np.ndarray, background: np.ndarray, cuffs: np.ndarray
+    view: SteadyView, images: np.ndarray, background: np.ndarray, near: _Near
 ) -> np.ndarray:
     """The same where the camera turns."""
-    still = _still_background(_looks(view.gathered(images), view.gathered(background)))
-    size = images.shape[1:3]
-    frames = enumerate(zip(images, cuffs, strict=True))
-    found = [_unlike(_floats(image), view.shown_in(t, still, size), near) for t, (image, near) in frames]
+    shown = view.gathered(background)
+    still = _still_background(_looks(view.gathered(images), shown), _always(view.gathered(near.arms), shown))
+    found = []
+    for t, (image, cuffs) in enumerate(zip(images, near.cuffs, strict=True)):
+        colors, hidden = (
+            view.shown_in(t, values, cuffs.shape)
+            for values in (still.colors, still.hidden.astype(np.float32))
+        )
+        seen = still._replace(colors=colors, hidden=hidden > 0.5)
+        found.append(_unlike(_floats(image), seen, cuffs))
     return background & np.stack(found)
 
 
-def _unlike(colors: np.ndarray, still: np.ndarray, cuffs: np.ndarray) -> np.ndarray:
-    """Where colours [H, W, 3] are not the background's; nowhere where that is not a number."""
-    differs = (np.abs(colors - still) > _THRESHOLD).any(axis=-1)
-    return differs & (cuffs | ~_shaded(colors, still))
+def _always(arms: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] where arms may be nearly always when masks [T, H, W] say background."""
+    return (arms & background).sum(axis=0) > _ALWAYS * background.sum(axis=0)
+
+
+def _unlike(colors: np.ndarray, still: _Still, cuffs: np.ndarray) -> np.ndarray:
+    """Where colours [H, W, 3] are not the background's; nowhere where its own are not a number."""
+    differs = (np.abs(colors - still.colors) > _THRESHOLD).any(axis=-1)
+    differs &= cuffs | ~_shaded(colors, still.colors)
+    return np.where(still.hidden, smoothed(still.odds[color_cells(colors)]) > 0.0, differs)
 
 
 def _shaded(colors: np.ndarray, still: np.ndarray) -> np.ndarray:
@@ -183,12 +214,30 @@ def _looks(images: np.ndarray, background: np.ndarray) -> _Looks:
     return _Looks(usual, other, background.sum(axis=0) - other_frames, other_frames)
 
 
-def _still_background(looks: _Looks) -> np.ndarray:
-    """Colour [H, W, 3] of the background: of each pixel's two looks the one that is less like an occluder.
+class _Chosen(NamedTuple):
+    """Each pixel's looks by what they are taken for."""
+
+    still: np.ndarray  # [H, W, 3] the background's colour
+    moving: np.ndarray  # [H, W, 3]
+    still_frames: np.ndarray  # [H, W]
+    moving_frames: np.ndarray  # [H, W]
+
+
+def _chosen(looks: _Looks, swapped: np.ndarray) -> _Chosen:
+    """The usual look is the background's but where `swapped` [H, W]."""
+    usual, other, usual_frames, other_frames = looks
+    still, moving = np.where(swapped[..., None], (other, usual), (usual, other))
+    frames = np.where(swapped, (other_frames, usual_frames), (usual_frames, other_frames))
+    return _Chosen(still, moving, *frames)
+
+
+def _still_background(looks: _Looks, always: np.ndarray) -> _Still:
+    """The background: of each pixel's two looks the one that is less like an occluder.
 
     An occluder that moves has the same colours in many places, the background each of its colours in its own.
     So colours are counted, for occluders at first in the rarer looks and for the background in the usual
-    ones; contested pixels then choose, and colours are counted again.
+    ones; contested pixels then choose, and colours are counted again. In the end pixels where arms may
+    `always` [H, W] be choose neither, if the better look is more like an occluder, too.
     """
     usual, other, usual_frames, other_frames = looks
     contested = other_frames > _CONTESTED_SHARE * (usual_frames + other_frames)
@@ -197,19 +246,36 @@ def _still_background(looks: _Looks) -> np.ndarray:
     # What is seen more often is more likely the background.
     odds = np.log((usual_frames + 1) / (other_frames + 1))
     for _ in range(_ROUNDS if contested.any() else 0):
-        still, moving = np.where(swapped[..., None], (other, usual), (usual, other))
-        still_frames, moving_frames = np.where(
-            swapped, (other_frames, usual_frames), (usual_frames, other_frames)
-        )
-        of_background = color_counts(still, still_frames)
-        of_occluders = color_counts(moving, np.where(contested, moving_frames, 0))
+        chosen = _chosen(looks, swapped)
+        of_background = color_counts(chosen.still, chosen.still_frames)
+        of_occluders = color_counts(chosen.moving, np.where(contested, chosen.moving_frames, 0))
         gain = odds + _log_ratio(other, of_occluders, of_background)
         gain -= _log_ratio(usual, of_occluders, of_background)
         gain = smoothed(np.where(contested, gain, 0.0)) / np.maximum(area, 1e-3)
         before, swapped = swapped, contested & (gain < 0.0)
         if (swapped == before).all():
             break
-    return np.where(swapped[..., None], other, usual)
+    chosen = _chosen(looks, swapped)
+    of_occluders = color_counts(chosen.moving, np.where(contested, chosen.moving_frames, 0))
+    return _without_hidden(chosen, of_occluders, always)
+
+
+def _without_hidden(chosen: _Chosen, of_occluders: np.ndarray, always: np.ndarray) -> _Still:
+    """The background, and where among `always` [H, W] what looks most like it is an occluder all the same.
+
+    There its colours are more frequent among occluders than elsewhere in the background.
+    """
+    still, frames = chosen.still, chosen.still_frames
+    hidden = np.zeros(always.shape, dtype=bool)
+    for _ in range(_ROUNDS):
+        of_hidden = color_counts(still, np.where(hidden, frames, 0))
+        of_background = color_counts(still, np.where(hidden, 0, frames))
+        odds = np.log1p(of_occluders + of_hidden) - np.log1p(of_background)
+        gain = np.where(frames > 0, odds[color_cells(still)], 0.0)
+        before, hidden = hidden, always & (smoothed(gain) > 0.0)
+        if (hidden == before).all():
+            break
+    return _Still(still, hidden, odds)
 
 
 def _log_ratio(colors: np.ndarray, counts: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -29,11 +29,17 @@ def swaying(degrees: float) -> np.ndarray:
 
 
 def filmed(
-    turns: np.ndarray, rng: np.random.Generator, tall: int = 13
+    turns: np.ndarray, rng: np.random.Generator, tall: int = 13, resting: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pictures [T, H, W, 3] of a wall, with a hand that a mask shows and a sleeve that none does; both."""
+    """Pictures [T, H, W, 3] of a wall, with a hand that a mask shows and a sleeve that none does; both.
+
+    A square of another sleeve, so many pixels wide, rests before the wall's middle.
+    """
     wall = scipy.ndimage.gaussian_filter(rng.normal(size=(2 * HEIGHT, 2 * WIDTH, 3)), (4, 4, 0))
     wall = 0.5 + 0.15 * wall / wall.std()
+    rests = np.zeros(wall.shape[:2])
+    rests[HEIGHT : HEIGHT + resting, WIDTH : WIDTH + resting] = 1.0
+    wall[rests > 0.5] = [0.1, 0.2, 0.8]
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     images = []
     hand, sleeve = np.zeros((2, FRAMES, HEIGHT, WIDTH), dtype=bool)
@@ -44,6 +50,7 @@ def filmed(
         hand[t, 30:50, 20 + 5 * t : 40 + 5 * t] = True
         sleeve[t, 50 : 50 + tall, 24 + 5 * t : 36 + 5 * t] = True
         image[hand[t]], image[sleeve[t]] = [0.8, 0.6, 0.5], [0.1, 0.2, 0.8]
+        sleeve[t] |= (scipy.ndimage.map_coordinates(rests, at, order=1) > 0.5) & ~hand[t]
         images.append(image + rng.normal(0, 0.005, image.shape))
     return (255 * np.stack(images).clip(0, 1)).round().astype(np.uint8), hand, sleeve
 
@@ -101,6 +108,23 @@ def test_a_run_finds_sleeves_before_a_camera_that_sways(
     images, hand, sleeve = filmed(swaying(degrees), rng)
     clip = painted_clip(tmp_path, images, np.where(hand, np.uint8(150), np.uint8(0)), K)
     found, moving = unknown_occluders(clip, {})
+    assert moving == "turns, as the camera does"
+    assert found[sleeve].mean() > 0.9
+    near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
+    assert found[~near].mean() < 0.02
+
+
+def test_a_sleeve_that_rests_hides_the_wall_all_the_time(tmp_path: Path, rng: np.random.Generator) -> None:
+    """What it hides no frame shows, but it has the colours of another that moves, and an arm may be there."""
+    images, hand, sleeve = filmed(swaying(1.5), rng, tall=40, resting=14)
+    clip = painted_clip(tmp_path, images, np.where(hand, np.uint8(150), np.uint8(0)), K)
+    rests, moves = np.full((2, FRAMES, 21, 3), 0.5)
+    rests[..., :2] = (-0.03, 0.0)
+    rests[:, 4, 0] -= 0.1  # the arm goes right
+    moves[..., 0] = ((30 + 5 * np.arange(FRAMES) - WIDTH / 2) / 110.0 * 0.5)[:, None]
+    moves[..., 1] = (50 - HEIGHT / 2) / 110.0 * 0.5
+    moves[:, 4, 1] -= 0.1  # down
+    found, moving = unknown_occluders(clip, {"right": rests, "left": moves})
     assert moving == "turns, as the camera does"
     assert found[sleeve].mean() > 0.9
     near = scipy.ndimage.binary_dilation(sleeve, np.ones((1, 9, 9)))
