@@ -25,6 +25,7 @@ from bigs.train.digest import run_digest
 from bigs.train.fit_report import FROZEN, OUTSIDE, SETTLED, FitReport
 from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
+from bigs.train.grasps.size_trials import try_sizes
 from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.refinement import refined
@@ -189,7 +190,7 @@ def fit(
         if isinstance(stage, ScaleSearchStage):
             size = search_object_scale(scene, stage, sources.certainty(), sources.occlusion(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {size.text()}"})
-            report.facts["object size"] = f"last searched, by where hands touch it: x {size.text()}"
+            report.add_fact("object size", f"x {size.text()} by where hands touch it")
         elif isinstance(stage, GraspStage):
             grasps = find_grasps(scene, stage, sources.meeting, sources.mismatch(stage))
             for side, found in grasps.items():
@@ -216,6 +217,13 @@ def fit(
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
         else:
+            grasped = any(grasps.count for grasps in scene.grasps.values())
+            if stage.size_trials is not None and continues is None and grasped:
+                watch.begin("object sizes on trial")
+                factor = _try_sizes(scene, stage, sources, config.seed)
+                listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
+                report.add_fact("object size", f"x {factor:.3f} by steps on trial")
+                watch.begin(stage.name)
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen_and_show)
             if last.step < stage.steps:
                 left = stage.steps - last.step
@@ -337,6 +345,18 @@ def _optimise(
         config.checkpoint_every,
         warn,
     )
+
+
+def _try_sizes(scene: Scene, stage: OptimizeStage, sources: EvidenceSource, seed: int) -> float:
+    """Find the object's size before a stage; returns the factor by which it changed."""
+    evidence = sources.evidence(stage)
+
+    def losses(trial: OptimizeStage) -> list[float]:
+        found: list[float] = []
+        run_stage(scene, trial, evidence, seed, after_step=lambda progress, _: found.append(progress.loss))
+        return found
+
+    return try_sizes(scene, stage, losses)
 
 
 def _check_networks(config: RunConfig, perceptual: VggWeights | None, denoiser: Denoiser | None) -> None:

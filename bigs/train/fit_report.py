@@ -24,6 +24,10 @@ class FitReport:
     # Seconds of the interrupted runs that this one continues; `seconds` includes them.
     before: float = 0.0
 
+    def add_fact(self, about: str, text: str) -> None:
+        """One more thing that was found out about something."""
+        self.facts[about] = f"{self.facts[about]}, {text}" if about in self.facts else text
+
     def spare(self, what: str, seconds: float) -> None:
         """Count seconds that were not spent on something."""
         self.spared[what] = self.spared.get(what, 0.0) + seconds

@@ -146,7 +146,17 @@ def _object_smooth(config: RunConfig) -> RunConfig:
 
 
 def _scale_search(config: RunConfig) -> RunConfig:
-    return _keep(config, leave_out=ScaleSearchStage)
+    return _keep(_no_size_trials(config), leave_out=ScaleSearchStage)
+
+
+def _no_size_trials(config: RunConfig) -> RunConfig:
+    return replace(
+        config,
+        stages=tuple(
+            replace(stage, size_trials=None) if isinstance(stage, OptimizeStage) else stage
+            for stage in config.stages
+        ),
+    )
 
 
 def _keep_fields(config: RunConfig) -> RunConfig:
@@ -243,7 +253,9 @@ _INGREDIENTS = {
         "the object's motion: the smoothing of its estimates, and acceleration",
         _all_of(_terms("object_acceleration"), _object_smooth),
     ),
-    "scale_search": Switch("the search of the object's size alone", _scale_search),
+    "scale_search": Switch(
+        "the search of the object's size and the steps on trial that correct it", _scale_search
+    ),
     "grasps": Switch(
         "grasps, in which the object carries a hand",
         _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),

@@ -65,6 +65,10 @@ def test_every_switch_does_something_somewhere() -> None:
     assert idle == []
 
 
+def trials_of_size(config: RunConfig) -> bool:
+    return any(stage.size_trials for stage in config.stages if isinstance(stage, OptimizeStage))
+
+
 def test_the_papers_switches() -> None:
     assert not without(FAST, "share").hand.shared
     smooth = without(FAST, "smooth")
@@ -74,6 +78,7 @@ def test_the_papers_switches() -> None:
     contact = without(FAST, "contact")
     assert weights(FAST) - weights(contact) == {"contact", "finger_contact", "penetration"}
     assert ScaleSearchStage in kinds(FAST) and ScaleSearchStage not in kinds(contact)
+    assert trials_of_size(FAST) and not trials_of_size(contact)
     # Without per-frame poses the paper's second step has nothing to move.
     assert [stage.name for stage in without(PAPER, "frame_poses").stages][:2] == ["hands", "object"]
 

@@ -72,7 +72,7 @@ def search_object_scale(
     if not any(bool(t.any()) for t in touching.values()):
         return FoundSize(1.0, float("nan"), factors, costs)
     pieces = [(side, piece) for side in hands for piece in _pieces(scene, side, touching[side])]
-    best, spread = _lowest(factors, costs), float("nan")
+    best, spread = lowest(factors, costs), float("nan")
     if len(pieces) > 1:
         best, spread = _agreed(_of_choices(factors, gaps, touching, pieces, hidden))
     scene.object_poses.log_scale.copy_(start + torch.tensor(best).log())
@@ -85,8 +85,8 @@ def _costs(gaps: dict[Side, Tensor], touching: dict[Side, Tensor]) -> Tensor:
     return torch.stack(means).mean(0)
 
 
-def _lowest(factors: Tensor, costs: Tensor) -> float:
-    """The factor of the least cost, between those tried by the parabola through it and its neighbours."""
+def lowest(factors: Tensor, costs: Tensor) -> float:
+    """The one of evenly spaced factors [C] that has the least cost [C], between them by a parabola."""
     best = int(costs.argmin())
     if best in (0, len(costs) - 1):
         return float(factors[best])
@@ -120,7 +120,7 @@ def _of_choices(
         weights = {side: torch.zeros_like(touch) for side, touch in touching.items()}
         for count, (side, piece) in zip(times.tolist(), pieces, strict=True):
             weights[side] += count * piece * touching[side]
-        found.append(_lowest(factors, _costs(gaps, weights) + hidden))
+        found.append(lowest(factors, _costs(gaps, weights) + hidden))
     return torch.tensor(found)
 
 

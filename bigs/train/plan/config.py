@@ -16,6 +16,18 @@ StepKind = Literal["single-subject", "interacting-subjects"]
 
 
 @dataclass(frozen=True)
+class SizeTrialsConfig:
+    """The object's size by a stage's first steps on trial (see `train.grasps.size_trials`)."""
+
+    # Sizes to try: this one, those by `span` larger and smaller, and further ones where the lowest loss lies
+    # at an end, `most` in all.
+    span: float = 0.05
+    most: int = 5
+    # Steps of every trial.
+    steps: int = 10
+
+
+@dataclass(frozen=True)
 class OptimizeStage:
     """One stage of gradient descent: what may change, which terms it minimises, and for how long."""
 
@@ -47,6 +59,8 @@ class OptimizeStage:
     stop_gain: float = 0.005
     # Clone, split and prune the object's Gaussians during the stage; None keeps their number.
     densify: DensifyConfig | None = None
+    # Find the object's size before the stage begins, by its first steps; None keeps it.
+    size_trials: SizeTrialsConfig | None = None
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from bigs.train.plan.config import (
     RefineStage,
     RunConfig,
     ScaleSearchStage,
+    SizeTrialsConfig,
     SplitStage,
 )
 from bigs.train.plan.paper import PAPER
@@ -106,6 +107,7 @@ _CONTACT = OptimizeStage(
     weights={"silhouette": 1.0, **_GRASP_PRIORS, **_TOUCH},
     image_size=160,
     stop_patience=_SETTLED,
+    size_trials=SizeTrialsConfig(),
 )
 # What steps from a frame's own start cannot mend.
 _MOVES = MoveStage(
@@ -275,7 +277,6 @@ FAST = RunConfig(
         ScaleSearchStage(),
         GraspStage(),
         _GRASPED,
-        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
         _CONTACT,
         _MOVES,
@@ -330,9 +331,8 @@ FULL = replace(
         GraspStage(),
         replace(_GRASPED, steps=50),
         replace(_FIELDS, steps=80),
-        ScaleSearchStage(name="object-scale-search-2", span=0.05, candidates=21),
         GraspStage(name="grasps-2"),
-        replace(_CONTACT, steps=50),
+        replace(_CONTACT, steps=50, size_trials=SizeTrialsConfig(steps=20)),
         _MOVES,
         # Every step brings outlines nearer, and poses with them, long after the loss looks settled.
         replace(_REGRASP, steps=160, stop_patience=0),
@@ -365,7 +365,7 @@ SMOKE = replace(
         GraspStage(),
         replace(_GRASPED, steps=8, image_size=80),
         replace(_FIELDS, steps=10, image_size=80, frames_per_step=3),
-        replace(_CONTACT, steps=8, image_size=80),
+        replace(_CONTACT, steps=8, image_size=80, size_trials=SizeTrialsConfig(most=3, steps=2)),
         replace(_MOVES, trial_steps=(3, 3), image_size=80, rounds=2),
         replace(_REGRASP, steps=8, image_size=80),
         _FREED,

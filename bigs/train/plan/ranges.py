@@ -28,6 +28,7 @@ from bigs.train.plan.config import (
     RefineStage,
     RunConfig,
     ScaleSearchStage,
+    SizeTrialsConfig,
     SplitStage,
 )
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
@@ -102,6 +103,7 @@ RANGES: dict[type, dict[str, Range]] = {
     CompletionConfig: {"enough": _SHARE},
     OpeningConfig: {"frames": _COUNT, "share": _SHARE},
     OptimizeStage: {"image_size": _PIXELS, "final_lr": _SHARE, "adam_betas": Range(0.0, 0.9999999)},
+    SizeTrialsConfig: {"span": Range(0.0, 0.999, open=True), "most": Range(3, 100), "steps": _COUNT},
     ScaleSearchStage: {
         "span": Range(0.0, 0.999),
         "candidates": Range(1, 10**4),

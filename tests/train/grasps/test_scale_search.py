@@ -7,7 +7,7 @@ import torch
 from toy_scenes import CENTER, HALF, cube_scene
 
 from bigs.hand import HandModel
-from bigs.train.grasps.scale_search import _agreed, _costs, _lowest, _of_choices, search_object_scale
+from bigs.train.grasps.scale_search import _agreed, _costs, _of_choices, lowest, search_object_scale
 from bigs.train.plan.config import ScaleSearchStage
 from bigs.types import Side
 
@@ -97,7 +97,7 @@ def test_many_choices_err_less_than_one_where_grasps_scatter() -> None:
         own = 1.0 + 0.04 * torch.randn(6, generator=generator)
         away = (factors[:, None] - own[of_frame]).abs()
         gaps, sure = {"right": away / (away + 0.01)}, {"right": torch.ones(24)}
-        once.append(_lowest(factors, _costs(gaps, sure)) - 1.0)
+        once.append(lowest(factors, _costs(gaps, sure)) - 1.0)
         factor, spread = _agreed(_of_choices(factors, gaps, sure, pieces, torch.zeros(len(factors))))
         chosen.append(factor - 1.0)
         assert 0.0 < spread < 0.06
