@@ -34,7 +34,9 @@ def try_sizes(scene: Scene, stage: OptimizeStage, run: Callable[[OptimizeStage],
     assert stage.size_trials is not None and scene.object_poses is not None
     log_scale = scene.object_poses.log_scale
     rates = {group: rate for group, rate in stage.lrs.items() if group != _SIZE}
-    trial = replace(stage, steps=stage.size_trials.steps, lrs=rates, stop_patience=0, size_trials=None)
+    trial = replace(
+        stage, steps=stage.size_trials.steps, lrs=rates, stop_patience=0, densify=None, size_trials=None
+    )
     start = [(parameter, parameter.detach().clone()) for parameter in scene.parameters()]
     spacing = math.log1p(stage.size_trials.span)
 

@@ -248,7 +248,7 @@ def _still_background(looks: _Looks, always: np.ndarray) -> _Still:
     for _ in range(_ROUNDS if contested.any() else 0):
         chosen = _chosen(looks, swapped)
         of_background = color_counts(chosen.still, chosen.still_frames)
-        of_occluders = color_counts(chosen.moving, np.where(contested, chosen.moving_frames, 0))
+        of_occluders = _of_occluders(chosen, contested)
         gain = odds + _log_ratio(other, of_occluders, of_background)
         gain -= _log_ratio(usual, of_occluders, of_background)
         gain = smoothed(np.where(contested, gain, 0.0)) / np.maximum(area, 1e-3)
@@ -256,8 +256,12 @@ def _still_background(looks: _Looks, always: np.ndarray) -> _Still:
         if (swapped == before).all():
             break
     chosen = _chosen(looks, swapped)
-    of_occluders = color_counts(chosen.moving, np.where(contested, chosen.moving_frames, 0))
-    return _without_hidden(chosen, of_occluders, always)
+    return _without_hidden(chosen, _of_occluders(chosen, contested), always)
+
+
+def _of_occluders(chosen: _Chosen, contested: np.ndarray) -> np.ndarray:
+    """How often colours were seen of occluders, where pixels show two looks."""
+    return color_counts(chosen.moving, np.where(contested, chosen.moving_frames, 0))
 
 
 def _without_hidden(chosen: _Chosen, of_occluders: np.ndarray, always: np.ndarray) -> _Still:

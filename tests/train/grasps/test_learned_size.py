@@ -13,10 +13,11 @@ from bigs.fused.outline import covered_shares
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
 from bigs.train.grasps.find import find_grasps
+from bigs.train.grasps.size_trials import try_sizes
 from bigs.train.loop.run_stage import run_stage
 from bigs.train.loop.step import Evidence
 from bigs.train.loop.targets import Targets
-from bigs.train.plan.config import GraspStage, OptimizeStage
+from bigs.train.plan.config import GraspStage, OptimizeStage, SizeTrialsConfig
 from bigs.train.plan.presets import PRESETS
 
 FRAMES = 8
@@ -56,6 +57,24 @@ def test_a_grasp_seen_from_several_sides_tells_it(wrong: float) -> None:
         scene.object_poses.log_scale.fill_(math.log(wrong))
     run_stage(scene, STAGE, evidence, 0)
     assert float(scene.object_poses.log_scale.detach().exp()) == pytest.approx(1.0, abs=0.008)
+
+
+@pytest.mark.parametrize("wrong", [0.92, 0.98, 1.07])
+def test_steps_on_trial_tell_it_too(wrong: float) -> None:
+    """With no rate for the size: positions in grasps, which go with the object, are all that moves."""
+    scene = turning_scene(frames=FRAMES, turn=math.pi / 3)
+    evidence = outlines(scene)
+    find_grasps(scene, GraspStage(slack=0.0), {side: torch.ones(FRAMES) for side in scene.sides})
+    with torch.no_grad():
+        scene.object_poses.log_scale.fill_(math.log(wrong))
+
+    def losses(stage: OptimizeStage) -> list[float]:
+        found: list[float] = []
+        run_stage(scene, stage, evidence, 0, after_step=lambda progress, _: found.append(progress.loss))
+        return found
+
+    factor = try_sizes(scene, replace(STAGE, size_trials=SizeTrialsConfig()), losses)
+    assert factor * wrong == pytest.approx(1.0, abs=0.015)
 
 
 def test_without_a_grasp_it_stays() -> None:

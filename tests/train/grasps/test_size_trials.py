@@ -12,6 +12,7 @@ from bigs.hand import HandModel
 from bigs.models.scene import Scene
 from bigs.train.grasps.size_trials import try_sizes
 from bigs.train.plan.config import OptimizeStage, SizeTrialsConfig
+from bigs.train.plan.densify_config import DensifyConfig
 from bigs.types import Side
 
 STAGE = OptimizeStage(
@@ -21,6 +22,7 @@ STAGE = OptimizeStage(
     lrs={"hand.pose": 0.01, "object.scale": 0.003},
     weights={"silhouette": 1.0},
     stop_patience=3,
+    densify=DensifyConfig(),
     size_trials=SizeTrialsConfig(span=0.05, most=5, steps=6),
 )
 
@@ -71,4 +73,4 @@ def test_trials_are_the_stages_first_steps_at_a_fixed_size(both_hands: dict[Side
     try_sizes(scene, STAGE, run)
     for trial in run.stages:
         assert trial.lrs == {"hand.pose": 0.01} and trial.weights == STAGE.weights
-        assert (trial.steps, trial.stop_patience, trial.size_trials) == (6, 0, None)
+        assert (trial.steps, trial.stop_patience, trial.densify, trial.size_trials) == (6, 0, None, None)
