@@ -39,8 +39,8 @@ class Bowl:
         with torch.no_grad():
             for parameter in self.scene.parameters():
                 parameter.add_(1.0)
-        # The first half falls from somewhere else.
-        return [9.0] * (stage.steps // 2) + [0.1 + off * off] * (stage.steps - stage.steps // 2)
+        # The first steps say something else.
+        return [9.0 + off] * (stage.steps // 2) + [0.1 + off * off] * (stage.steps - stage.steps // 2)
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,27 @@ def test_finds_a_sleeve_that_rests(tmp_path: Path, rng: np.random.Generator, res
     assert not found[:, 2:8, 60:70].any()
 
 
+def test_background_that_a_sleeve_leaves_once_is_seen(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Neither look of a sleeve of two shades is the background; the one frame without it tells by colour."""
+    bright, dark = [0.1, 0.15, 0.9], [0.1, 0.05, 0.5]
+    images = np.broadcast_to(room(rng), (FRAMES, HEIGHT, WIDTH, 3)).copy()
+    hand, rests = np.zeros((2, FRAMES, HEIGHT, WIDTH), dtype=bool)
+    hand[:, 26:32, 4:8] = True
+    images[hand] = [0.8, 0.6, 0.5]
+    rests[:-1, 20:36, 8:24] = True
+    images[:5, 20:36, 8:24], images[5:-1, 20:36, 8:24] = bright, dark
+    for t in range(FRAMES):
+        images[t, 40:49, 4 * t : 4 * t + 30], images[t, 49:58, 4 * t : 4 * t + 30] = bright, dark
+    clip = painted_clip(tmp_path, to_bytes(images, rng), np.where(hand, np.uint8(150), np.uint8(0)))
+    joints = {
+        "right": wrist_at(np.full(FRAMES, 8.0), 28, (1.0, 0.0)),
+        "left": wrist_at(4.0 * np.arange(FRAMES), 49, (1.0, 0.0)),
+    }
+    found = unknown_occluders(clip, joints).pixels
+    assert found[rests].mean() > 0.95
+    assert found[-1, 22:34, 12:22].mean() < 0.1
+
+
 @pytest.mark.parametrize(
     ("light", "resting", "counts"),
     [
