@@ -146,17 +146,7 @@ def _object_smooth(config: RunConfig) -> RunConfig:
 
 
 def _scale_search(config: RunConfig) -> RunConfig:
-    return _keep(_no_size_trials(config), leave_out=ScaleSearchStage)
-
-
-def _no_size_trials(config: RunConfig) -> RunConfig:
-    return replace(
-        config,
-        stages=tuple(
-            replace(stage, size_trials=None) if isinstance(stage, OptimizeStage) else stage
-            for stage in config.stages
-        ),
-    )
+    return _keep(config, lambda stage: replace(stage, size_trials=None), leave_out=ScaleSearchStage)
 
 
 def _keep_fields(config: RunConfig) -> RunConfig:
