@@ -22,7 +22,8 @@ TORCH_STAMP := $(if $(filter cpu,$(TORCH)),.venv/torch-cpu)
 
 setup: $(BIN)/bigs
 
-# Rebuilt when a Rust source, the packaging or a version changes; Python sources are used in place.
+# Rebuilt when a Rust source, the packaging or a version changes; Python sources are used in place. They are compiled
+# here, since many containers let Python write no bytecode, and every start would compile them anew.
 RUST_SOURCES := $(shell find rust -name '*.rs' -o -name Cargo.toml) Cargo.toml Cargo.lock
 $(BIN)/bigs: pyproject.toml constraints.txt $(RUST_SOURCES) $(TORCH_STAMP)
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -30,6 +31,7 @@ $(BIN)/bigs: pyproject.toml constraints.txt $(RUST_SOURCES) $(TORCH_STAMP)
 	    "(5.4 GB on disk); make $(or $(MAKECMDGOALS),setup) TORCH=cpu needs about 0.5 GB (1.5 GB on disk)."
 	$(BIN)/python -m pip install --quiet maturin
 	. $(BIN)/activate && maturin develop --release --extras dev,synthetic,video
+	@$(BIN)/python -m compileall -q bigs
 	@touch $(BIN)/bigs
 
 # maturin keeps a torch that is there. uv knows where the builds without CUDA lie, pip only if it was told.

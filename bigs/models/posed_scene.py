@@ -88,10 +88,14 @@ class PosedScene:
         pose = self.object
         return (points - pose.centers[:, None]) @ pose.rotations / pose.scale
 
-    def touch(self, side: Side) -> Touch:
-        """What touches the object's surface, metres: of the whole hand, then of each of its `fingertips`."""
+    def touch(self, side: Side, carrier: ObjectFrames | None = None) -> Touch:
+        """What touches the object's surface, metres: of the whole hand, then of each of its `fingertips`.
+
+        The object has the poses `carrier`, or its own.
+        """
         tips = (Group(_PAD, tip) for tip in self._scene.hand_model(side).fingertips)
-        return self._scene.object_distance.touch(self.posing(side), *self.object, (WHOLE_HAND, *tips))
+        carrier = carrier or self.object
+        return self._scene.object_distance.touch(self.posing(side), *carrier, (WHOLE_HAND, *tips))
 
     def posing(self, side: Side, vertices: Tensor | None = None) -> Posing:
         """What carries a hand's vertices, or some of them (indices), to camera space."""

@@ -23,9 +23,9 @@ from bigs.motion.tracker import TrackedMotion
 from bigs.threads import beside
 from bigs.train.digest import run_digest
 from bigs.train.fit_report import FROZEN, OUTSIDE, SETTLED, FitReport
+from bigs.train.grasps.depth_search import search_grasp_depths
 from bigs.train.grasps.find import find_grasps
 from bigs.train.grasps.scale_search import search_object_scale
-from bigs.train.grasps.size_trials import try_sizes
 from bigs.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.refinement import refined
@@ -35,6 +35,7 @@ from bigs.train.loop.target_source import TargetSource
 from bigs.train.moves.search import search_moves
 from bigs.train.plan.config import (
     CompletionStage,
+    GraspDepthStage,
     GraspStage,
     GuidanceStage,
     MoveStage,
@@ -196,6 +197,13 @@ def fit(
             for side, found in grasps.items():
                 text = f"{side} hand holds the object in frames {found.text()}"
                 listen({"event": "note", "stage": stage.name, "text": text})
+        elif isinstance(stage, GraspDepthStage):
+            depths = search_grasp_depths(scene, stage)
+            listen({"event": "note", "stage": stage.name, "text": f"object size x {depths.text()}"})
+            report.add_fact("object size", f"x {depths.text()} by the depths of grasps")
+            for side in scene.sides:
+                text = f"{side} hand: distances of grasps {depths.text_of(side)}"
+                listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, MoveStage):
             moved = search_moves(scene, stage, sources.evidence(stage), sources.mismatch(stage))
             for side, moves in moved.items():
@@ -217,13 +225,6 @@ def fit(
                 report.skipped.append(f"{stage.name}: {done.skipped}")
             report.facts |= done.facts
         else:
-            grasped = any(grasps.count for grasps in scene.grasps.values())
-            if stage.size_trials is not None and continues is None and grasped:
-                watch.begin("object sizes on trial")
-                factor = _try_sizes(scene, stage, sources, config.seed)
-                listen({"event": "note", "stage": stage.name, "text": f"object size x {factor:.3f}"})
-                report.add_fact("object size", f"x {factor:.3f} by steps on trial")
-                watch.begin(stage.name)
             last = _optimise(scene, stage, index, sources, config, continues, keep, report, listen_and_show)
             if last.step < stage.steps:
                 left = stage.steps - last.step
@@ -257,7 +258,7 @@ def _image_sizes(stages: Sequence[Stage]) -> list[int]:
     for stage in stages:
         if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage | MoveStage | RefineStage):
             sizes.append(stage.image_size)
-        elif not isinstance(stage, ObjectMotionStage):
+        elif not isinstance(stage, ObjectMotionStage | GraspDepthStage):
             sizes.append(OBSERVED_AT.image_size)
     return sizes
 
@@ -347,18 +348,6 @@ def _optimise(
     )
 
 
-def _try_sizes(scene: Scene, stage: OptimizeStage, sources: EvidenceSource, seed: int) -> float:
-    """Find the object's size before a stage; returns the factor by which it changed."""
-    evidence = sources.evidence(stage)
-
-    def losses(trial: OptimizeStage) -> list[float]:
-        found: list[float] = []
-        run_stage(scene, trial, evidence, seed, after_step=lambda progress, _: found.append(progress.loss))
-        return found
-
-    return try_sizes(scene, stage, losses)
-
-
 def _check_networks(config: RunConfig, perceptual: VggWeights | None, denoiser: Denoiser | None) -> None:
     for stage in config.stages:
         if isinstance(stage, OptimizeStage) and "perceptual" in stage.weights and perceptual is None:
@@ -369,7 +358,7 @@ def _check_networks(config: RunConfig, perceptual: VggWeights | None, denoiser: 
 
 def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
     """Why a stage has nothing to do on this clip, or None."""
-    if isinstance(stage, ScaleSearchStage | GraspStage):
+    if isinstance(stage, ScaleSearchStage | GraspStage | GraspDepthStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
         return None

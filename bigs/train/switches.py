@@ -10,6 +10,7 @@ from bigs.train.loop.optim import ONLY_FREE
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
 from bigs.train.plan.config import (
     CompletionStage,
+    GraspDepthStage,
     GraspStage,
     GuidanceStage,
     MoveStage,
@@ -146,7 +147,7 @@ def _object_smooth(config: RunConfig) -> RunConfig:
 
 
 def _scale_search(config: RunConfig) -> RunConfig:
-    return _keep(config, lambda stage: replace(stage, size_trials=None), leave_out=ScaleSearchStage)
+    return _keep(config, leave_out=(ScaleSearchStage, GraspDepthStage))
 
 
 def _keep_fields(config: RunConfig) -> RunConfig:
@@ -227,7 +228,7 @@ _INGREDIENTS = {
         _all_of(_terms("smooth", "acceleration"), _smooth),
     ),
     "contact": Switch(
-        "contact of hands and fingers, penetration, and the search of the object's size, which they decide",
+        "contact of hands and fingers, penetration, and the searches that they decide, of size and depths",
         _all_of(_terms("contact", "finger_contact", "penetration"), _scale_search),
     ),
     "frame_poses": Switch("pose residuals of single frames", _groups(*_FRAME_POSES)),
@@ -243,12 +244,14 @@ _INGREDIENTS = {
         "the object's motion: the smoothing of its estimates, and acceleration",
         _all_of(_terms("object_acceleration"), _object_smooth),
     ),
-    "scale_search": Switch(
-        "the search of the object's size and the steps on trial that correct it", _scale_search
-    ),
+    "scale_search": Switch("the searches of the object's size and of grasps' depths", _scale_search),
     "grasps": Switch(
         "grasps, in which the object carries a hand",
-        _all_of(lambda config: _keep(config, leave_out=GraspStage), _groups(*_GRASP_GROUPS), _free_frames),
+        _all_of(
+            lambda config: _keep(config, leave_out=(GraspStage, GraspDepthStage)),
+            _groups(*_GRASP_GROUPS),
+            _free_frames,
+        ),
     ),
     "free_frames": Switch("the steps for frames between grasps", _free_frames),
     "moves": Switch(

@@ -12,6 +12,7 @@ from bigs.models.object_splats import ObjectSplatsConfig
 from bigs.train.check_plan import check_plan
 from bigs.train.loop.terms import IMAGE_TERMS, TERMS
 from bigs.train.plan.config import (
+    GraspDepthStage,
     GraspStage,
     MoveStage,
     OptimizeStage,
@@ -65,10 +66,6 @@ def test_every_switch_does_something_somewhere() -> None:
     assert idle == []
 
 
-def trials_of_size(config: RunConfig) -> bool:
-    return any(stage.size_trials for stage in config.stages if isinstance(stage, OptimizeStage))
-
-
 def test_the_papers_switches() -> None:
     assert not without(FAST, "share").hand.shared
     smooth = without(FAST, "smooth")
@@ -77,15 +74,15 @@ def test_the_papers_switches() -> None:
     assert weights(PAPER) - weights(without(PAPER, "smooth")) == {"smooth"}
     contact = without(FAST, "contact")
     assert weights(FAST) - weights(contact) == {"contact", "finger_contact", "penetration"}
-    assert ScaleSearchStage in kinds(FAST) and ScaleSearchStage not in kinds(contact)
-    assert trials_of_size(FAST) and not trials_of_size(contact)
+    searches = {ScaleSearchStage, GraspDepthStage}
+    assert searches <= kinds(FAST) and not searches & kinds(contact)
     # Without per-frame poses the paper's second step has nothing to move.
     assert [stage.name for stage in without(PAPER, "frame_poses").stages][:2] == ["hands", "object"]
 
 
 def test_our_switches() -> None:
     grasps = without(FAST, "grasps")
-    assert GraspStage not in kinds(grasps)
+    assert not {GraspStage, GraspDepthStage} & kinds(grasps)
     assert groups(FAST) - groups(grasps) == {"hand.grasp_orient", "hand.grasp_pose", "hand.grasp_position"}
     lighting = without(FAST, "lighting")
     assert not lighting.lighting

@@ -31,8 +31,12 @@ class FoundSize(NamedTuple):
 
     def text(self) -> str:
         """The factor, and its error where it is known."""
-        known = self.spread == self.spread
-        return f"{self.factor:.3f} ± {self.spread:.3f}" if known else f"{self.factor:.3f}"
+        return in_words(self.factor, self.spread)
+
+
+def in_words(factor: float, spread: float) -> str:
+    """A factor and its standard error, which may be NaN."""
+    return f"{factor:.3f} ± {spread:.3f}" if spread == spread else f"{factor:.3f}"
 
 
 @torch.no_grad()
@@ -74,7 +78,7 @@ def search_object_scale(
     pieces = [(side, piece) for side in hands for piece in _pieces(scene, side, touching[side])]
     best, spread = lowest(factors, costs), float("nan")
     if len(pieces) > 1:
-        best, spread = _agreed(_of_choices(factors, gaps, touching, pieces, hidden))
+        best, spread = agreed(_of_choices(factors, gaps, touching, pieces, hidden))
     scene.object_poses.log_scale.copy_(start + torch.tensor(best).log())
     return FoundSize(best, spread, factors, costs)
 
@@ -112,11 +116,8 @@ def _of_choices(
     hidden: Tensor,
 ) -> Tensor:
     """The factors of least cost [R] for random choices of as many pieces, each any number of times."""
-    generator = torch.Generator().manual_seed(0)
-    drawn = torch.randint(len(pieces), (_CHOICES, len(pieces)), generator=generator)
     found = []
-    for choice in drawn:
-        times = torch.bincount(choice, minlength=len(pieces))
+    for times in choices(len(pieces)):
         weights = {side: torch.zeros_like(touch) for side, touch in touching.items()}
         for count, (side, piece) in zip(times.tolist(), pieces, strict=True):
             weights[side] += count * piece * touching[side]
@@ -124,7 +125,14 @@ def _of_choices(
     return torch.tensor(found)
 
 
-def _agreed(found: Tensor) -> tuple[float, float]:
+def choices(count: int) -> Tensor:
+    """How often each of `count` pieces of evidence is asked in random choices of as many: [R, count]."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randint(count, (_CHOICES, count), generator=generator)
+    return torch.nn.functional.one_hot(drawn, count).sum(1)
+
+
+def agreed(found: Tensor) -> tuple[float, float]:
     """The bootstrap's estimate and its standard error.
 
     Under poor masks the cost has a wide floor with several minima, and which of them is the least hangs on

@@ -16,18 +16,6 @@ StepKind = Literal["single-subject", "interacting-subjects"]
 
 
 @dataclass(frozen=True)
-class SizeTrialsConfig:
-    """The object's size by a stage's first steps on trial (see `train.grasps.size_trials`)."""
-
-    # Sizes to try: this one, those by `span` larger and smaller, and further ones where the lowest loss lies
-    # at an end, `most` in all.
-    span: float = 0.05
-    most: int = 5
-    # Steps of every trial.
-    steps: int = 10
-
-
-@dataclass(frozen=True)
 class OptimizeStage:
     """One stage of gradient descent: what may change, which terms it minimises, and for how long."""
 
@@ -59,8 +47,6 @@ class OptimizeStage:
     stop_gain: float = 0.005
     # Clone, split and prune the object's Gaussians during the stage; None keeps their number.
     densify: DensifyConfig | None = None
-    # Find the object's size before the stage begins, by its first steps; None keeps it.
-    size_trials: SizeTrialsConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +96,25 @@ class GraspStage:
     alike: float = 10.0
     # Factor on the residuals that a frame of a grasp adds to it; 0 makes grasps rigid.
     slack: float = 0.1
+
+
+@dataclass(frozen=True)
+class GraspDepthStage:
+    """Depths of grasps, and the object's size, by where fingers touch (see `train.grasps.depth_search`)."""
+
+    name: str = "grasp-depths"
+    step: StepKind = "interacting-subjects"
+    # Distances and sizes to try: the logarithms of `candidates` factors, evenly spaced in -span ... span.
+    span: float = 0.18
+    candidates: int = 37
+    # Metres at which a gap between a finger and the surface counts half, and what a grasp of hands that reach
+    # nothing costs, as a negative log-likelihood: as much as an estimate that is off by so many errors.
+    reach: float = 0.02
+    weight: float = 8.0
+    # Errors of a hand's place across and along the view, as in `GraspStage`; and of the object's size.
+    error_aside: float = 0.007
+    error_along: float = 0.03
+    size_error: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -285,6 +290,7 @@ Stage = (
     | ObjectMotionStage
     | ScaleSearchStage
     | GraspStage
+    | GraspDepthStage
     | MoveStage
     | SplitStage
     | RefineStage

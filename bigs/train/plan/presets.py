@@ -7,6 +7,7 @@ from dataclasses import replace
 from bigs.fields.triplane import TriplaneConfig
 from bigs.train.plan.config import (
     CompletionStage,
+    GraspDepthStage,
     GraspStage,
     GuidanceStage,
     MoveStage,
@@ -16,7 +17,6 @@ from bigs.train.plan.config import (
     RefineStage,
     RunConfig,
     ScaleSearchStage,
-    SizeTrialsConfig,
     SplitStage,
 )
 from bigs.train.plan.paper import PAPER
@@ -107,7 +107,6 @@ _CONTACT = OptimizeStage(
     weights={"silhouette": 1.0, **_GRASP_PRIORS, **_TOUCH},
     image_size=160,
     stop_patience=_SETTLED,
-    size_trials=SizeTrialsConfig(),
 )
 # What steps from a frame's own start cannot mend.
 _MOVES = MoveStage(
@@ -277,6 +276,7 @@ FAST = RunConfig(
         ScaleSearchStage(),
         GraspStage(),
         _GRASPED,
+        GraspDepthStage(),
         GraspStage(name="grasps-2"),
         _CONTACT,
         _MOVES,
@@ -300,6 +300,7 @@ DEMO = replace(
         ScaleSearchStage(),
         GraspStage(),
         replace(_GRASPED, steps=30),
+        GraspDepthStage(),
         GraspStage(name="grasps-2"),
         replace(_CONTACT, steps=30),
         _MOVES,
@@ -331,8 +332,9 @@ FULL = replace(
         GraspStage(),
         replace(_GRASPED, steps=50),
         replace(_FIELDS, steps=80),
+        GraspDepthStage(),
         GraspStage(name="grasps-2"),
-        replace(_CONTACT, steps=50, size_trials=SizeTrialsConfig(steps=20)),
+        replace(_CONTACT, steps=50),
         _MOVES,
         # Every step brings outlines nearer, and poses with them, long after the loss looks settled.
         replace(_REGRASP, steps=160, stop_patience=0),
@@ -364,8 +366,9 @@ SMOKE = replace(
         ScaleSearchStage(candidates=15),
         GraspStage(),
         replace(_GRASPED, steps=8, image_size=80),
+        GraspDepthStage(candidates=19),
         replace(_FIELDS, steps=10, image_size=80, frames_per_step=3),
-        replace(_CONTACT, steps=8, image_size=80, size_trials=SizeTrialsConfig(most=3, steps=2)),
+        replace(_CONTACT, steps=8, image_size=80),
         replace(_MOVES, trial_steps=(3, 3), image_size=80, rounds=2),
         replace(_REGRASP, steps=8, image_size=80),
         _FREED,

@@ -19,6 +19,7 @@ from bigs.motion.patches import PatchConfig
 from bigs.motion.tracker_config import TrackerConfig
 from bigs.raster.settings import RasterSettings
 from bigs.train.plan.config import (
+    GraspDepthStage,
     GraspStage,
     GuidanceStage,
     MoveStage,
@@ -28,7 +29,6 @@ from bigs.train.plan.config import (
     RefineStage,
     RunConfig,
     ScaleSearchStage,
-    SizeTrialsConfig,
     SplitStage,
 )
 from bigs.train.plan.start_config import CompletionConfig, InitialConfig
@@ -103,7 +103,6 @@ RANGES: dict[type, dict[str, Range]] = {
     CompletionConfig: {"enough": _SHARE},
     OpeningConfig: {"frames": _COUNT, "share": _SHARE},
     OptimizeStage: {"image_size": _PIXELS, "final_lr": _SHARE, "adam_betas": Range(0.0, 0.9999999)},
-    SizeTrialsConfig: {"span": Range(0.0, 0.999, open=True), "most": Range(3, 100), "steps": _COUNT},
     ScaleSearchStage: {
         "span": Range(0.0, 0.999),
         "candidates": Range(1, 10**4),
@@ -114,6 +113,11 @@ RANGES: dict[type, dict[str, Range]] = {
         "least": Range(2, 10**9),
         **dict.fromkeys(("free", "excess", "error_aside", "error_along", "alike"), _POSITIVE),
         "image_size": _PIXELS,
+    },
+    GraspDepthStage: {
+        "span": Range(0.0, 0.999, open=True),
+        "candidates": Range(3, 10**4),
+        **dict.fromkeys(("reach", "error_aside", "error_along", "size_error"), _POSITIVE),
     },
     MoveStage: {"image_size": _PIXELS, "best": _COUNT, "gain": _SHARE, "loose_gain": _SHARE},
     ObjectMotionStage: {"calibrated_automatic": _SHARE},

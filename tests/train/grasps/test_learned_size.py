@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -13,12 +12,10 @@ from bigs.fused.outline import covered_shares
 from bigs.models.scene import Scene
 from bigs.raster import RasterSettings
 from bigs.train.grasps.find import find_grasps
-from bigs.train.grasps.size_trials import try_sizes
 from bigs.train.loop.run_stage import run_stage
 from bigs.train.loop.step import Evidence
 from bigs.train.loop.targets import Targets
-from bigs.train.plan.config import GraspStage, OptimizeStage, SizeTrialsConfig
-from bigs.train.plan.presets import PRESETS
+from bigs.train.plan.config import GraspStage, OptimizeStage
 
 FRAMES = 8
 STAGE = OptimizeStage(
@@ -62,34 +59,3 @@ def test_a_grasp_seen_from_several_sides_tells_it(wrong: float) -> None:
     scene, evidence = held(wrong)
     run_stage(scene, STAGE, evidence, 0)
     assert float(scene.object_poses.log_scale.detach().exp()) == pytest.approx(1.0, abs=0.008)
-
-
-@pytest.mark.parametrize("wrong", [0.92, 0.98, 1.07])
-def test_steps_on_trial_tell_it_too(wrong: float) -> None:
-    """With no rate for the size: positions in grasps, which go with the object, are all that moves."""
-    scene, evidence = held(wrong)
-
-    def losses(stage: OptimizeStage) -> list[float]:
-        found: list[float] = []
-        run_stage(scene, stage, evidence, 0, after_step=lambda progress, _: found.append(progress.loss))
-        return found
-
-    factor = try_sizes(scene, replace(STAGE, size_trials=SizeTrialsConfig()), losses)
-    assert factor * wrong == pytest.approx(1.0, abs=0.015)
-
-
-def test_without_a_grasp_it_stays() -> None:
-    """The object's picture is the same at any size, and Adam takes full steps along mere rounding."""
-    scene = turning_scene(frames=FRAMES, turn=math.pi / 3)
-    pictured = replace(STAGE, step="interacting-subjects", weights={"image": 1.0})
-    before = scene.object_poses.log_scale.clone()
-    run_stage(scene, pictured, outlines(scene), 0)
-    assert torch.equal(scene.object_poses.log_scale, before)
-
-
-@pytest.mark.parametrize("name", ["fast", "full", "demo"])
-def test_plans_learn_it_while_hands_hold_the_object(name: str) -> None:
-    learned = {
-        s.name for s in PRESETS[name].stages if isinstance(s, OptimizeStage) and "object.scale" in s.lrs
-    }
-    assert learned == {"grasped", "contact", "joint"}

@@ -7,7 +7,7 @@ import torch
 from toy_scenes import CENTER, HALF, cube_scene
 
 from bigs.hand import HandModel
-from bigs.train.grasps.scale_search import _agreed, _costs, _of_choices, lowest, search_object_scale
+from bigs.train.grasps.scale_search import _costs, _of_choices, agreed, lowest, search_object_scale
 from bigs.train.plan.config import ScaleSearchStage
 from bigs.types import Side
 
@@ -98,7 +98,7 @@ def test_many_choices_err_less_than_one_where_grasps_scatter() -> None:
         away = (factors[:, None] - own[of_frame]).abs()
         gaps, sure = {"right": away / (away + 0.01)}, {"right": torch.ones(24)}
         once.append(lowest(factors, _costs(gaps, sure)) - 1.0)
-        factor, spread = _agreed(_of_choices(factors, gaps, sure, pieces, torch.zeros(len(factors))))
+        factor, spread = agreed(_of_choices(factors, gaps, sure, pieces, torch.zeros(len(factors))))
         chosen.append(factor - 1.0)
         assert 0.0 < spread < 0.06
     assert torch.tensor(chosen).square().mean() < 0.7 * torch.tensor(once).square().mean()
