@@ -361,7 +361,8 @@ def _not_needed(stage: Stage, scene: Scene, report: FitReport) -> str | None:
     if isinstance(stage, ScaleSearchStage | GraspStage | GraspDepthStage):
         if scene.object_splats is None or not scene.sides:
             return "the clip has no hand and object together"
-        return None
+        grasped = any(grasps.count for grasps in scene.grasps.values())
+        return "no hand holds the object" if isinstance(stage, GraspDepthStage) and not grasped else None
     if isinstance(stage, CompletionStage | GuidanceStage | RefineStage) and scene.object_splats is None:
         return "the clip has no object"
     if isinstance(stage, MoveStage):

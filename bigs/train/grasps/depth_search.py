@@ -101,10 +101,11 @@ def _size(
 
     each = []
     for grasp, costs in zip(grasps, _costs(scene, posed, grasps, logs, stage, nearer), strict=True):
-        away = posed.object.centers[grasp.own].norm(dim=-1) / posed.hand(grasp.side).wrist[grasp.own].norm(
-            dim=-1
+        wrists, centers = (
+            points[grasp.own].norm(dim=-1).mean()
+            for points in (posed.hand(grasp.side).wrist, posed.object.centers)
         )
-        hands = float(away.mean()) * (logs - logs[:, None])
+        hands = centers / wrists * (logs - logs[:, None])
         each.append((costs + 0.5 * (hands / grasp.error).square()).amin(1))
     prior = 0.5 * (logs / stage.size_error).square()
     if len(each) == 1:

@@ -12,6 +12,8 @@ from toy_scenes import CENTER, HALF, cube_scene, turning_scene
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
 from bigs.models.scene import Scene
+from bigs.train.fit import _not_needed
+from bigs.train.fit_report import FitReport
 from bigs.train.grasps.depth_search import _error, _Grasp, _move, _sights, search_grasp_depths
 from bigs.train.plan.config import GraspDepthStage
 from bigs.types import Side
@@ -136,6 +138,7 @@ def test_without_grasps_nothing_changes(both_hands: dict[Side, HandModel]) -> No
     assert found.size == 1.0
     assert math.isnan(found.spread)
     assert found.text_of("left") == "(none)"
+    assert _not_needed(STAGE, scene, FitReport()) == "no hand holds the object"
     for name, value in scene.state_dict().items():
         assert torch.equal(value, before[name]), name
 
