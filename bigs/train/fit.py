@@ -41,6 +41,7 @@ from bigs.train.plan.config import (
     MoveStage,
     ObjectMotionStage,
     OptimizeStage,
+    PictureStage,
     RefineStage,
     RunConfig,
     ScaleSearchStage,
@@ -198,7 +199,7 @@ def fit(
                 text = f"{side} hand holds the object in frames {found.text()}"
                 listen({"event": "note", "stage": stage.name, "text": text})
         elif isinstance(stage, GraspDepthStage):
-            depths = search_grasp_depths(scene, stage)
+            depths = search_grasp_depths(scene, stage, sources.seen(stage))
             listen({"event": "note", "stage": stage.name, "text": f"object size x {depths.text()}"})
             report.add_fact("object size", f"x {depths.text()} by the depths of grasps")
             for side in scene.sides:
@@ -256,9 +257,9 @@ def _image_sizes(stages: Sequence[Stage]) -> list[int]:
     """The sizes at which stages look at the clip's images, in their order."""
     sizes = []
     for stage in stages:
-        if isinstance(stage, OptimizeStage | ScaleSearchStage | GraspStage | MoveStage | RefineStage):
+        if isinstance(stage, PictureStage):
             sizes.append(stage.image_size)
-        elif not isinstance(stage, ObjectMotionStage | GraspDepthStage):
+        elif not isinstance(stage, ObjectMotionStage):
             sizes.append(OBSERVED_AT.image_size)
     return sizes
 

@@ -51,7 +51,7 @@ class _Grasp(NamedTuple):
 
 
 @torch.no_grad()
-def search_grasp_depths(scene: Scene, stage: GraspDepthStage) -> FoundDepths:
+def search_grasp_depths(scene: Scene, stage: GraspDepthStage, seen: dict[Side, Tensor]) -> FoundDepths:
     """Set the object's scale, which does not change its projection, and the distances of grasps beside it.
 
     The likeliest size and distances: fingers leave few gaps, hands are about where they were, and the object
@@ -60,12 +60,13 @@ def search_grasp_depths(scene: Scene, stage: GraspDepthStage) -> FoundDepths:
     Args:
         scene: with an object and hands; changed in place, left as it was without a grasp.
         stage: what to try, and the errors.
+        seen: for each hand [T] how much of it its mask shows, in [0, 1].
     """
     assert scene.object_poses is not None
     logs = torch.linspace(-stage.span, stage.span, stage.candidates)
     posed = scene.at(torch.arange(scene.n_frames))
     grasps = [
-        _Grasp(side, number, own, _error(_sights(posed, side, own), stage))
+        _Grasp(side, number, own, _error(_sights(posed, side, own), seen[side][own], stage))
         for side in scene.sides
         for number in range(scene.grasps[side].count)
         for own in [scene.grasps[side].of_frame == number]
@@ -142,16 +143,17 @@ def _sights(posed: PosedScene, side: Side, own: Tensor) -> Tensor:
     return (rotations.transpose(-1, -2) @ posed.hand(side).wrist[own][..., None])[..., 0]
 
 
-def _error(sights: Tensor, stage: GraspDepthStage) -> float:
+def _error(sights: Tensor, seen: Tensor, stage: GraspDepthStage) -> float:
     """How far the outlines of a grasp may be wrong about its distance, relative.
 
-    Where the object turns, later frames see from aside what is depth in earlier ones. Frames of a grasp err
-    alike, so that many of them say no more than a few.
+    The less of a hand is seen [B] the less its outline tells. Where the object turns, later frames see from
+    aside what is depth in earlier ones. Frames of a grasp err alike, so that many say no more than a few.
     """
     rays = torch.nn.functional.normalize(sights, dim=-1).double()
     along = rays[:, :, None] * rays[:, None, :]
     aside = torch.eye(3, dtype=torch.float64) - along
-    information = (aside / stage.error_aside**2 + along / stage.error_along**2).mean(0)
+    depth = (stage.error_along / seen.double()).clamp(max=stage.error_hidden)[:, None, None]
+    information = (aside / stage.error_aside**2 + along / depth**2).mean(0)
     middle = torch.nn.functional.normalize(rays.mean(0), dim=0)
     return math.sqrt(float(middle @ torch.linalg.solve(information, middle)))
 

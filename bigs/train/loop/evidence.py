@@ -18,10 +18,10 @@ from bigs.train.loop.image_terms import labels
 from bigs.train.loop.step import Evidence, Selection, Step, spread_frames
 from bigs.train.loop.target_source import TargetSource
 from bigs.train.plan.config import (
+    GraspDepthStage,
     GraspStage,
     MoveStage,
-    OptimizeStage,
-    RefineStage,
+    PictureStage,
     RunConfig,
     ScaleSearchStage,
 )
@@ -73,9 +73,7 @@ class EvidenceSource:
             for side, touching in self.touching().items()
         }
 
-    def evidence(
-        self, stage: OptimizeStage | ScaleSearchStage | GraspStage | MoveStage | RefineStage
-    ) -> Evidence:
+    def evidence(self, stage: PictureStage) -> Evidence:
         """What the terms of a stage look at, at its image size and as far as grasps are known by now."""
         targets = self.targets.at(stage.image_size)
         return Evidence(
@@ -114,3 +112,15 @@ class EvidenceSource:
             return torch.where(shown[frames], squares / area[frames], torch.nan)
 
         return ask
+
+    @torch.no_grad()
+    def seen(self, stage: GraspDepthStage) -> dict[Side, Tensor]:
+        """For each hand [T] how much of what it covers its mask shows, in [0, 1], as the scene is."""
+        evidence, frames = self.evidence(stage), torch.arange(len(self.clip))
+        step = Step(self.scene, evidence, {}, Selection(frames))
+        found = {}
+        for side in self.scene.sides:
+            covers = step.covered(side, self.scene.at(frames).verts(side))
+            shows = (covers * evidence.targets.shares[side]).sum((1, 2))
+            found[side] = shows / covers.sum((1, 2)).clamp_min(1.0)
+        return found

@@ -111,10 +111,15 @@ class GraspDepthStage:
     # nothing costs, as a negative log-likelihood: as much as an estimate that is off by so many errors.
     reach: float = 0.02
     weight: float = 8.0
-    # Errors of a hand's place across and along the view, as in `GraspStage`; and of the object's size.
+    # Errors of a hand's place across and along the view, as standard deviations per metre of distance. Along
+    # it, an outline of which a mask shows a part tells the less, down to what estimates tell.
     error_aside: float = 0.007
-    error_along: float = 0.03
+    error_along: float = 0.012
+    error_hidden: float = 0.08
+    # Error of the object's size, relative.
     size_error: float = 0.05
+    # Long side in pixels at which masks are compared with hands.
+    image_size: int = 160
 
 
 @dataclass(frozen=True)
@@ -285,18 +290,9 @@ class OpeningConfig:
     inside: float = 0.004
 
 
-Stage = (
-    OptimizeStage
-    | ObjectMotionStage
-    | ScaleSearchStage
-    | GraspStage
-    | GraspDepthStage
-    | MoveStage
-    | SplitStage
-    | RefineStage
-    | CompletionStage
-    | GuidanceStage
-)
+# The stages that look at the clip's pictures at a size of their own.
+PictureStage = OptimizeStage | ScaleSearchStage | GraspStage | GraspDepthStage | MoveStage | RefineStage
+Stage = PictureStage | ObjectMotionStage | SplitStage | CompletionStage | GuidanceStage
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ RANGES: dict[type, dict[str, Range]] = {
     GraspDepthStage: {
         "span": Range(0.0, 0.999, open=True),
         "candidates": Range(3, 10**4),
-        **dict.fromkeys(("reach", "error_aside", "error_along", "size_error"), _POSITIVE),
+        **dict.fromkeys(("reach", "error_aside", "error_along", "error_hidden", "size_error"), _POSITIVE),
+        "image_size": _PIXELS,
     },
     MoveStage: {"image_size": _PIXELS, "best": _COUNT, "gain": _SHARE, "loose_gain": _SHARE},
     ObjectMotionStage: {"calibrated_automatic": _SHARE},

@@ -22,6 +22,8 @@ STAGE = GraspDepthStage()
 # Fingers decide against everything else.
 FINGERS = replace(STAGE, weight=100.0)
 FRAMES = torch.arange(6)
+# Hands of which pictures show a third.
+SEEN: dict[Side, torch.Tensor] = {"right": torch.full((6,), 0.35), "left": torch.full((6,), 0.35)}
 TWO_GRASPS = torch.tensor([0, 0, 0, 1, 1, 1])
 GRID_STEP = 2 * STAGE.span / (STAGE.candidates - 1)
 
@@ -40,7 +42,7 @@ def held(both_hands: dict[Side, HandModel]) -> Scene:
             poses.position.restart(wrist.expand(len(FRAMES), 3))
         for side in scene.sides:
             scene.grasps[side].set(TWO_GRASPS, 0.0, scene.at(FRAMES).hand(side), scene.at(FRAMES).object)
-    search_grasp_depths(scene, FINGERS)
+    search_grasp_depths(scene, FINGERS, SEEN)
     return scene
 
 
@@ -57,7 +59,7 @@ def depths(scene: Scene, side: Side) -> torch.Tensor:
 
 
 def test_what_was_found_is_found_again(held: Scene) -> None:
-    found = search_grasp_depths(held, FINGERS)
+    found = search_grasp_depths(held, FINGERS, SEEN)
     assert found.size == pytest.approx(1.0, abs=1e-3)
     for side in held.sides:
         torch.testing.assert_close(found.moved[side], torch.ones(2), atol=2e-3, rtol=0)
@@ -69,7 +71,7 @@ def test_a_grasp_that_is_off_comes_back_to_the_others(held: Scene, wrong: float)
     before = {side: depths(held, side) for side in held.sides}
     push(held, "left", 1, wrong)
     assert depths(held, "left")[1] == pytest.approx(wrong * before["left"][1])
-    found = search_grasp_depths(held, FINGERS)
+    found = search_grasp_depths(held, FINGERS, SEEN)
     first, second = found.moved["left"].tolist()
     assert second * wrong == pytest.approx(first, abs=0.5 * GRID_STEP)
     assert found.size == pytest.approx(1.0, abs=0.25 * abs(1.0 - wrong))
@@ -82,7 +84,7 @@ def test_a_grasp_that_is_off_comes_back_to_the_others(held: Scene, wrong: float)
 
 def test_where_a_hand_was_counts_too(held: Scene) -> None:
     push(held, "left", 1, 1.05)
-    assert 1.0 / 1.04 < float(search_grasp_depths(held, STAGE).moved["left"][1]) < 1.0 / 1.01
+    assert 1.0 / 1.04 < float(search_grasp_depths(held, STAGE, SEEN).moved["left"][1]) < 1.0 / 1.01
 
 
 @pytest.mark.parametrize("wrong", [0.93, 1.06])
@@ -93,7 +95,7 @@ def test_what_all_grasps_have_in_common_is_the_size(held: Scene, wrong: float) -
             for grasp in range(2):
                 push(held, side, grasp, 1.0 / wrong)
     before = {side: depths(held, side) for side in held.sides}
-    found = search_grasp_depths(held, STAGE)
+    found = search_grasp_depths(held, STAGE, SEEN)
     assert found.size == pytest.approx(1.0 / wrong, abs=0.02)
     for side in held.sides:
         torch.testing.assert_close(depths(held, side), before[side], atol=0, rtol=0.02)
@@ -104,7 +106,7 @@ def test_what_is_likely_decides_where_all_is_the_same(held: Scene) -> None:
     """Fingers of no weight leave everything where it was, however far away."""
     push(held, "right", 0, 1.2)
     before = {side: depths(held, side) for side in held.sides}
-    found = search_grasp_depths(held, replace(STAGE, weight=0.0))
+    found = search_grasp_depths(held, replace(STAGE, weight=0.0), SEEN)
     assert found.size == pytest.approx(1.0)
     for side in held.sides:
         torch.testing.assert_close(depths(held, side), before[side])
@@ -114,7 +116,7 @@ def test_a_grasp_that_is_not_sure_says_little(held: Scene) -> None:
     with torch.no_grad():
         held.grasps["left"].certainty[3:] = 0.01
     push(held, "left", 1, 0.95)
-    found = search_grasp_depths(held, STAGE)
+    found = search_grasp_depths(held, STAGE, SEEN)
     assert found.moved["left"][1] == pytest.approx(1.0, abs=0.5 * GRID_STEP)
 
 
@@ -124,7 +126,7 @@ def test_frames_stay_where_they_are_in_the_picture(held: Scene) -> None:
         held.grasps[side].release([5])
     push(held, "right", 0, 0.95)
     before = {side: held.at(FRAMES).hand(side).wrist.clone() for side in held.sides}
-    search_grasp_depths(held, STAGE)
+    search_grasp_depths(held, STAGE, SEEN)
     for side in held.sides:
         after = held.at(FRAMES).hand(side).wrist
         torch.testing.assert_close(after[:, :2] / after[:, 2:], before[side][:, :2] / before[side][:, 2:])
@@ -134,7 +136,7 @@ def test_frames_stay_where_they_are_in_the_picture(held: Scene) -> None:
 def test_without_grasps_nothing_changes(both_hands: dict[Side, HandModel]) -> None:
     scene = cube_scene(both_hands, 0.9)
     before = {name: value.clone() for name, value in scene.state_dict().items()}
-    found = search_grasp_depths(scene, STAGE)
+    found = search_grasp_depths(scene, STAGE, SEEN)
     assert found.size == 1.0
     assert math.isnan(found.spread)
     assert found.text_of("left") == "(none)"
@@ -145,11 +147,13 @@ def test_without_grasps_nothing_changes(both_hands: dict[Side, HandModel]) -> No
 
 @torch.no_grad()
 def test_a_grasp_seen_from_several_sides_is_known_better() -> None:
-    def error(turn: float) -> float:
+    def error(turn: float, seen: float) -> float:
         scene = turning_scene(frames=8, turn=turn)
-        posed = scene.at(torch.arange(8))
-        return _error(_sights(posed, "right", torch.ones(8, dtype=torch.bool)), STAGE)
+        sights = _sights(scene.at(torch.arange(8)), "right", torch.ones(8, dtype=torch.bool))
+        return _error(sights, torch.full((8,), seen), STAGE)
 
-    still, some, much = error(0.0), error(0.5), error(2.0)
-    assert still == pytest.approx(STAGE.error_along, rel=1e-3)
+    still, some, much = error(0.0, 0.4), error(0.5, 0.4), error(2.0, 0.4)
+    assert still == pytest.approx(STAGE.error_along / 0.4, rel=1e-3)
     assert STAGE.error_aside < much < 0.5 * some < 0.5 * still
+    assert error(0.0, 1.0) == pytest.approx(STAGE.error_along, rel=1e-3)
+    assert error(0.0, 0.0) == pytest.approx(STAGE.error_hidden, rel=1e-3)

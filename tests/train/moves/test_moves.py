@@ -25,7 +25,7 @@ from bigs.train.loop.evidence import EvidenceSource
 from bigs.train.loop.targets import Targets
 from bigs.train.moves.search import search_moves
 from bigs.train.moves.trials import Trials
-from bigs.train.plan.config import MoveStage, RunConfig
+from bigs.train.plan.config import GraspDepthStage, MoveStage, RunConfig
 from bigs.train.plan.presets import FAST
 from bigs.types import SIDES, Side
 
@@ -337,3 +337,20 @@ def test_an_outline_that_is_seen_whole_tells_depth_against_what_is_expected(wavi
     trials = Trials(waving, "right", STAGE, sources.evidence(STAGE), sources.mismatch(STAGE))
     found = trials.fit(at, start, 200).poses.wrist[:, 2].log() - (poses.expected_log_depth[at] - off)
     assert found.abs() < 0.15 * off
+
+
+def test_how_much_of_a_hand_its_mask_shows(waving: Scene) -> None:
+    sources = pictures_of(waving)
+    shares = sources.targets.at(0).shares["left"]
+    whole = sources.seen(GraspDepthStage())
+    assert all((share > 0.85).all() and (share <= 1.0).all() for share in whole.values())
+    shares[2, :, :70] = 0.0
+    shares[4] = 0.0
+    less = sources.seen(GraspDepthStage())
+    torch.testing.assert_close(less["right"], whole["right"])
+    others = [0, 1, 3, 5, 6]
+    torch.testing.assert_close(less["left"][others], whole["left"][others])
+    kept = shares[2].square().sum() / pictures_of(waving).targets.at(0).shares["left"][2].sum()
+    assert 0.05 < float(kept) < 0.8
+    torch.testing.assert_close(less["left"][2], kept, rtol=1e-3, atol=0)
+    assert less["left"][4] == 0.0
