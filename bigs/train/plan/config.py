@@ -107,8 +107,8 @@ class GraspDepthStage:
     # Distances and sizes to try: the logarithms of `candidates` factors, evenly spaced in -span ... span.
     span: float = 0.18
     candidates: int = 37
-    # Metres at which a gap between a finger and the surface counts half, and what a grasp of hands that reach
-    # nothing costs, as a negative log-likelihood: as much as an estimate that is off by so many errors.
+    # Metres at which a gap to the surface counts half, and what it costs if the fingers reach nothing, and as
+    # much again if nothing of the hand does: a negative log-likelihood, that of an error of four deviations.
     reach: float = 0.02
     weight: float = 8.0
     # Errors of a hand's place across and along the view, as standard deviations per metre of distance. Along

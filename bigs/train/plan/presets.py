@@ -366,7 +366,7 @@ SMOKE = replace(
         ScaleSearchStage(candidates=15),
         GraspStage(),
         replace(_GRASPED, steps=8, image_size=80),
-        GraspDepthStage(candidates=19),
+        GraspDepthStage(candidates=19, image_size=80),
         replace(_FIELDS, steps=10, image_size=80, frames_per_step=3),
         replace(_CONTACT, steps=8, image_size=80),
         replace(_MOVES, trial_steps=(3, 3), image_size=80, rounds=2),

@@ -9,12 +9,14 @@ import pytest
 import torch
 from toy_scenes import CENTER, HALF, cube_scene, turning_scene
 
+from bigs.fused.touch import Touch
 from bigs.geometry.rotations import axis_angle_to_matrix
 from bigs.hand import HandModel
+from bigs.models.posed_scene import PosedScene
 from bigs.models.scene import Scene
 from bigs.train.fit import _not_needed
 from bigs.train.fit_report import FitReport
-from bigs.train.grasps.depth_search import _error, _Grasp, _move, _sights, search_grasp_depths
+from bigs.train.grasps.depth_search import _costs, _error, _Grasp, _move, _sights, search_grasp_depths
 from bigs.train.plan.config import GraspDepthStage
 from bigs.types import Side
 
@@ -110,6 +112,27 @@ def test_what_is_likely_decides_where_all_is_the_same(held: Scene) -> None:
     assert found.size == pytest.approx(1.0)
     for side in held.sides:
         torch.testing.assert_close(depths(held, side), before[side])
+
+
+@pytest.mark.parametrize(
+    ("hand", "fingers", "gap"),
+    [
+        (0.0, [0.0] * 4, 0.0),
+        (0.02, [0.0] * 4, 0.5),
+        (-0.02, [0.02, -0.02, 0.0, 0.0], 0.75),
+        (0.0, [0.06] * 4, 0.75),
+    ],
+)
+def test_the_hand_and_its_fingers_count_alike(
+    held: Scene, monkeypatch: pytest.MonkeyPatch, hand: float, fingers: list[float], gap: float
+) -> None:
+    depths = torch.tensor([[hand, *fingers]]).expand(len(FRAMES), 5)
+    touch = Touch(depths, torch.zeros(len(FRAMES)))
+    monkeypatch.setattr(PosedScene, "touch", lambda self, side, carrier: touch)
+    posed = held.at(FRAMES)
+    grasps = [_Grasp("left", 1, TWO_GRASPS == 1, 0.0)]
+    (costs,) = _costs(held, posed, grasps, torch.zeros(2), STAGE, lambda side, factor: posed.object)
+    torch.testing.assert_close(costs, torch.full((2,), STAGE.weight * gap))
 
 
 def test_a_grasp_that_is_not_sure_says_little(held: Scene) -> None:
