@@ -87,7 +87,7 @@ def test_a_curve(finished_run: Run, tiny_clip: Path, tmp_path: Path, monkeypatch
     # How well shapes are aligned is not asked here, and each point of the curve asks for one.
     monkeypatch.setattr(align, "_COARSE_ITERATIONS", 2)
     monkeypatch.setattr(align, "_FINE_ITERATIONS", 2)
-    plan = RunPlan((tiny_clip,), ("smoke",), curve_every=0.3, growth_steps=0)
+    plan = RunPlan((tiny_clip,), ("smoke",), curve_every=0.1, growth_steps=0)
     assert bench_reconstruct(plan, tmp_path, picture=False).failed == []
     (run,) = json.loads((tmp_path / "reconstruct.json").read_text())["runs"]
     points, times = run["curve"], run["times"]

@@ -158,7 +158,7 @@ def test_a_grasp_lets_go_of_a_frame_that_belongs_to_the_move(waving: Scene) -> N
     assert waving.grasps["right"].of_frame.tolist() == [0, 0, 0, 0, 0, -1, -1]
     assert waving.grasps["right"].certainty.tolist() == [1, 1, 1, 1, 1, 0, 0]
     assert waving.hand_poses["right"].has_expected_depth.tolist() == [False] * 5 + [True, False]
-    assert angles(waving, truth, "right").max() < 0.05
+    assert angles(waving, truth, "right").max() < 0.08
 
 
 def test_a_grasp_keeps_frames_that_no_pose_explains(waving: Scene) -> None:

@@ -124,13 +124,12 @@ def test_the_clips_frames_hold_what_they_show(
     # Pictures of what was found take the place of the clip's.
     found = replace(evidence, targets=replace(evidence.targets, images=step.together.colors.detach()))
     changes = []
-    # So heavy that a few steps of a wild prior, which go anywhere, are held for certain.
-    for weight in (0.0, 10.0):
-        stage = replace(STAGE, steps=24, lr_shift=2e-3, damage=1e9, frame_weight=weight)
+    for weight in (0.0, 100.0):
+        stage = replace(STAGE, steps=24, lr_shift=2e-4, damage=1e9, frame_weight=weight)
         scene, report = run(one_side, both_hands, replace(PLAN, stages=(SplitStage(parts=1), stage)), prior)
         assert "moved" in report.facts["prior"]
         changes.append(image_error(scene, found, ("object",), every))
-    assert changes[1] < 0.75 * changes[0], changes
+    assert changes[1] < 0.5 * changes[0], changes
     assert float((scene.object_splats().means - before.object_splats().means).abs().max()) > 1e-4
 
 
