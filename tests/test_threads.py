@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 import bigs
-from bigs.threads import beside, side_by_side
+from bigs.threads import beside, side_by_side, thread_count, torch_alone
 
 
 @pytest.fixture(params=[1, 2])
@@ -54,3 +55,16 @@ def test_nothing_else_makes_threads() -> None:
         if any(word in path.read_text() for word in ("ThreadPoolExecutor(", "workers=-1"))
     ]
     assert makers == ["threads.py"]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_torch_works_alone_in_the_block_only(fails: bool) -> None:
+    before = thread_count()
+    torch.set_num_threads(3)
+    try:
+        with contextlib.suppress(ZeroDivisionError), torch_alone():
+            assert thread_count() == 1
+            assert 1 / (not fails)
+        assert thread_count() == 3
+    finally:
+        torch.set_num_threads(before)

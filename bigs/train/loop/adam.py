@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from bigs.threads import torch_alone
+
 # The moments of one parameter: "step" (a scalar), "exp_avg" and "exp_avg_sq".
 Moments = Mapping[str, Tensor]
 
@@ -45,28 +47,29 @@ class FrameAdam:
     @torch.no_grad()
     def step(self) -> None:
         """One step along the gradients that there are."""
-        for group in self.param_groups:
-            moved = [parameter for parameter in group["params"] if parameter.grad is not None]
-            if not moved:
-                continue
-            states = [self._state_of(parameter) for parameter in moved]
-            counts = [state["step"] for state in states]
-            torch._foreach_add_(counts, 1)
-            torch._fused_adam_(
-                moved,
-                [parameter.grad for parameter in moved],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [],
-                counts,
-                lr=group["lr"],
-                beta1=group["betas"][0],
-                beta2=group["betas"][1],
-                weight_decay=0.0,
-                eps=group["eps"],
-                amsgrad=False,
-                maximize=False,
-            )
+        with torch_alone():
+            for group in self.param_groups:
+                moved = [parameter for parameter in group["params"] if parameter.grad is not None]
+                if not moved:
+                    continue
+                states = [self._state_of(parameter) for parameter in moved]
+                counts = [state["step"] for state in states]
+                torch._foreach_add_(counts, 1)
+                torch._fused_adam_(
+                    moved,
+                    [parameter.grad for parameter in moved],
+                    [state["exp_avg"] for state in states],
+                    [state["exp_avg_sq"] for state in states],
+                    [],
+                    counts,
+                    lr=group["lr"],
+                    beta1=group["betas"][0],
+                    beta2=group["betas"][1],
+                    weight_decay=0.0,
+                    eps=group["eps"],
+                    amsgrad=False,
+                    maximize=False,
+                )
 
     @torch.no_grad()
     def step_frames(self, frames: Tensor) -> None:
