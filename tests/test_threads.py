@@ -12,6 +12,7 @@ import torch
 
 import bigs
 from bigs.threads import beside, side_by_side, thread_count, torch_alone
+from bigs.train.loop.adam import FrameAdam
 
 
 @pytest.fixture(params=[1, 2])
@@ -62,9 +63,25 @@ def test_torch_works_alone_in_the_block_only(fails: bool) -> None:
     before = thread_count()
     torch.set_num_threads(3)
     try:
-        with contextlib.suppress(ZeroDivisionError), torch_alone():
+        with contextlib.suppress(KeyError), torch_alone():
             assert thread_count() == 1
-            assert 1 / (not fails)
+            if fails:
+                raise KeyError
         assert thread_count() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_adam_wakes_no_other_thread(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, fused = [], torch._fused_adam_
+
+    def counted(*args: object, **options: object) -> None:
+        counts.append(thread_count())
+        fused(*args, **options)
+
+    monkeypatch.setattr(torch, "_fused_adam_", counted)
+    values = torch.nn.Parameter(torch.ones(3))
+    values.grad = torch.ones(3)
+    FrameAdam([{"params": [values], "lr": 0.1}]).step()
+    assert counts == [1] and thread_count() == threads
+    torch.testing.assert_close(values.detach(), torch.full((3,), 0.9))

@@ -45,31 +45,31 @@ class FrameAdam:
             parameter.grad = None
 
     @torch.no_grad()
+    @torch_alone()
     def step(self) -> None:
         """One step along the gradients that there are."""
-        with torch_alone():
-            for group in self.param_groups:
-                moved = [parameter for parameter in group["params"] if parameter.grad is not None]
-                if not moved:
-                    continue
-                states = [self._state_of(parameter) for parameter in moved]
-                counts = [state["step"] for state in states]
-                torch._foreach_add_(counts, 1)
-                torch._fused_adam_(
-                    moved,
-                    [parameter.grad for parameter in moved],
-                    [state["exp_avg"] for state in states],
-                    [state["exp_avg_sq"] for state in states],
-                    [],
-                    counts,
-                    lr=group["lr"],
-                    beta1=group["betas"][0],
-                    beta2=group["betas"][1],
-                    weight_decay=0.0,
-                    eps=group["eps"],
-                    amsgrad=False,
-                    maximize=False,
-                )
+        for group in self.param_groups:
+            moved = [parameter for parameter in group["params"] if parameter.grad is not None]
+            if not moved:
+                continue
+            states = [self._state_of(parameter) for parameter in moved]
+            counts = [state["step"] for state in states]
+            torch._foreach_add_(counts, 1)
+            torch._fused_adam_(
+                moved,
+                [parameter.grad for parameter in moved],
+                [state["exp_avg"] for state in states],
+                [state["exp_avg_sq"] for state in states],
+                [],
+                counts,
+                lr=group["lr"],
+                beta1=group["betas"][0],
+                beta2=group["betas"][1],
+                weight_decay=0.0,
+                eps=group["eps"],
+                amsgrad=False,
+                maximize=False,
+            )
 
     @torch.no_grad()
     def step_frames(self, frames: Tensor) -> None:
