@@ -6,12 +6,12 @@ A clip's world is whatever the dataset chose; `cam_from_world` leads to the Open
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from bigs.data.images import read_image, read_mask
+from bigs.data.decoded import DecodedFrames
 from bigs.data.optics import Optics
 from bigs.names import check_name
 from bigs.types import MASK_VALUES, USUAL_FPS, Entity, Side
@@ -94,6 +94,7 @@ class Clip:
     black: float = 0.0
     brightness: float = 1.0
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
+    decoded: DecodedFrames = field(default_factory=DecodedFrames, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_name(f"{self.folder}: name", self.name)
@@ -121,8 +122,8 @@ class Clip:
 
     def _pinhole_image(self, t: int) -> np.ndarray:
         if self.optics is None:
-            return read_image(self.image_paths[t], (self.width, self.height))
-        return self.optics.pinhole(t, read_image(self.image_paths[t], self.optics.file_size), order=1)
+            return self.decoded.image(self.image_paths[t], (self.width, self.height))
+        return self.optics.pinhole(t, self.decoded.image(self.image_paths[t], self.optics.file_size), order=1)
 
     def mask(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8: 0 or one of `bigs.types.MASK_VALUES`. Arms are background."""
@@ -142,9 +143,11 @@ class Clip:
     def mask_with_arms(self, t: int) -> np.ndarray:
         """Labels of frame `t`, [H, W] uint8, in which arms belong to hands wherever the files say so."""
         if self.optics is None:
-            labels = read_mask(self.mask_paths[t], (self.width, self.height))
+            labels = self.decoded.mask(self.mask_paths[t], (self.width, self.height))
         else:
-            labels = self.optics.pinhole(t, read_mask(self.mask_paths[t], self.optics.file_size), order=0)
+            labels = self.optics.pinhole(
+                t, self.decoded.mask(self.mask_paths[t], self.optics.file_size), order=0
+            )
         return _EXCHANGED[labels] if self.swapped is not None and self.swapped[t] else labels
 
     def has_pixels(self, entity: Entity) -> np.ndarray:

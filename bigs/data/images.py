@@ -13,8 +13,7 @@ from PIL import Image
 from bigs.checks import MAX_PIXELS, InputError, check_pixels, found_at
 from bigs.files import open_regular
 from bigs.names import check_name
-from bigs.threads import side_by_side
-from bigs.types import ENTITIES, MASK_VALUES, Entity
+from bigs.types import MASK_VALUES
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MASK_SUFFIXES = (".png",)
@@ -118,33 +117,6 @@ def check_pairs(image_paths: Sequence[Path], mask_paths: Sequence[Path]) -> None
     for image, mask in zip(image_paths, mask_paths, strict=True):
         if image.stem != mask.stem:
             raise InputError(f"{mask_folder}: expected a mask named {image.stem}, found {mask.name}")
-
-
-def decode_frames(
-    image_paths: Sequence[Path], mask_paths: Sequence[Path], size: tuple[int, int]
-) -> dict[Entity, np.ndarray]:
-    """Decode everything once, as a check, and count each entity's mask pixels: {entity: [T]}.
-
-    Args:
-        image_paths: T images, or none to be checked.
-        mask_paths: T label masks, or none, and every count is 0.
-        size: (width, height) that each file must have.
-
-    Raises:
-        InputError: a file is unreadable or has another size.
-    """
-
-    def check(image: Path) -> None:
-        read_image(image, size)
-
-    def areas(mask: Path) -> list[int]:
-        counts = np.bincount(read_mask(mask, size).ravel(), minlength=256)
-        return [int(counts[MASK_VALUES[entity]]) for entity in ENTITIES]
-
-    side_by_side(check, image_paths)
-    counts = side_by_side(areas, mask_paths) or [[0] * len(ENTITIES)] * len(image_paths)
-    table = np.array(counts)
-    return {entity: table[:, column] for column, entity in enumerate(ENTITIES)}
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, str]:

@@ -15,11 +15,12 @@ from bigs.checks import InputError, check_positive
 from bigs.commands.clips.open import open_clip
 from bigs.commands.clips.truth import pose_annotation, read_annotation
 from bigs.data.base import Clip
+from bigs.data.decoded import DecodedFrames
 from bigs.data.excerpt import excerpt
 from bigs.data.formats.annotation import Annotation
 from bigs.data.formats.hold import GL_FROM_CV, write_hold
 from bigs.data.ground_truth import write_ground_truth
-from bigs.data.images import MASK_SUFFIXES, check_pairs, decode_frames, list_frames
+from bigs.data.images import MASK_SUFFIXES, check_pairs, list_frames
 from bigs.data.limited_view import limited_frames, object_directions
 from bigs.data.moving import in_world, move_hand, move_object
 from bigs.hand import HandModel, load_hand_models
@@ -78,7 +79,7 @@ def convert(
         masks = list_frames(plan.masks, MASK_SUFFIXES)
         check_pairs(clip.image_paths, masks)
         size = (clip.width, clip.height) if clip.optics is None else clip.optics.file_size
-        areas = decode_frames((), masks, size)
+        areas = DecodedFrames().read_all((), masks, size)
         clip = replace(clip, mask_paths=masks, mask_areas=areas, swapped=None, arms=None)
     if not clip.mask_paths:
         raise InputError(f"{source}: expected label masks (--masks), found none")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bigs.data.base import Clip, HandTrack, ObjectTrack
+from bigs.data.decoded import DecodedFrames
 from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
-from bigs.data.images import decode_frames
 from bigs.data.optics import Optics
 from bigs.types import Side
 
@@ -67,7 +67,8 @@ def annotated_clip(
         InputError: an image or a mask is unreadable or has another size than it should.
     """
     size = (annotation.width, annotation.height) if optics is None else optics.file_size
-    areas = decode_frames(image_paths, mask_paths, size)
+    decoded = DecodedFrames()
+    areas = decoded.read_all(image_paths, mask_paths, size)
     obj = None
     if annotation.object is not None:
         truth = annotation.object
@@ -99,6 +100,7 @@ def annotated_clip(
         scene_scale=1.0 / (RADIUS_PER_SHIFT * float(np.linalg.norm(shift))),
         normalize_shift=shift,
         mask_areas=areas,
+        decoded=decoded,
         annotated=True,
         optics=optics,
     )

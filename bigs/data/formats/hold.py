@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from bigs.checks import InputError, found_at
 from bigs.data.base import Clip, HandTrack, ObjectTrack
+from bigs.data.decoded import DecodedFrames
 from bigs.data.entries import array_entry, mapping_entry, positive_entry, require
 from bigs.data.frame_rate import rate_by_names
 from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
     check_pairs,
-    decode_frames,
     list_frames,
     read_image,
 )
@@ -83,6 +83,7 @@ def load_hold(path: str | Path) -> Clip:
     where = f"{file}: normalize_shift"
     normalize_shift = array_entry(where, require(where, data, "normalize_shift"), (3,))
 
+    decoded = DecodedFrames()
     return Clip(
         name=name,
         folder=folder,
@@ -97,7 +98,8 @@ def load_hold(path: str | Path) -> Clip:
         object=obj,
         scene_scale=scene_scale,
         normalize_shift=normalize_shift,
-        mask_areas=decode_frames(image_paths, mask_paths, (width, height)),
+        mask_areas=decoded.read_all(image_paths, mask_paths, (width, height)),
+        decoded=decoded,
         # HOLD's own files do not say.
         fps=positive_entry(f"{file}: fps", data["fps"]) if "fps" in data else rate_by_names(frame_names),
     )

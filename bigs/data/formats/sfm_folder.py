@@ -27,6 +27,7 @@ from bigs.archives import read_npz
 from bigs.checks import InputError, check_finite, check_rotations, shown
 from bigs.colmap import pycolmap
 from bigs.data.base import Clip, HandTrack, ObjectTrack
+from bigs.data.decoded import DecodedFrames
 from bigs.data.entries import array_entry, mapping_entry, positive_entry, require
 from bigs.data.formats.colmap_files import check_model_files
 from bigs.data.formats.hold import RADIUS_PER_SHIFT, shift_before
@@ -36,7 +37,6 @@ from bigs.data.images import (
     IMAGE_SUFFIXES,
     MASK_SUFFIXES,
     check_pairs,
-    decode_frames,
     list_frames,
     read_image,
 )
@@ -83,7 +83,8 @@ def load_sfm_folder(path: str | Path) -> Clip:
     mask_paths = list_frames(_first(folder, _MASK_FOLDERS), MASK_SUFFIXES)
     check_pairs(image_paths, mask_paths)
     height, width = read_image(image_paths[0]).shape[:2]
-    areas = decode_frames(image_paths, mask_paths, (width, height))
+    decoded = DecodedFrames()
+    areas = decoded.read_all(image_paths, mask_paths, (width, height))
     model = _read_transforms(folder, (width, height))
     if model is None:
         model = _read_colmap(folder, (width, height))
@@ -105,6 +106,7 @@ def load_sfm_folder(path: str | Path) -> Clip:
         scene_scale=1.0 / (RADIUS_PER_SHIFT * float(np.linalg.norm(shift))),
         normalize_shift=shift,
         mask_areas=areas,
+        decoded=decoded,
         fps=rate_by_names([file.name for file in image_paths]),
     )
 
