@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -12,9 +13,11 @@ from torch import Tensor
 
 from bigs.checks import InputError
 from bigs.losses.weighted import weighted_sum
+from bigs.models.free_gaussians import FreeGaussians
 from bigs.models.object_splats import ObjectSplats
 from bigs.models.occlusion import measure_occlusion
 from bigs.models.scene import Scene
+from bigs.threads import torch_alone
 from bigs.train.loop.adam import FrameAdam
 from bigs.train.loop.density import Pull, densified
 from bigs.train.loop.optim import FIELD_GROUPS, make_optimizer, set_rates
@@ -148,10 +151,11 @@ def run_stage(
     once, fields_spared = time.perf_counter() - began if fixed else 0.0, 0.0
     pixels_spared: float | None = None
 
+    evaluated = [entity for entity in entities if entity not in frozen] if needs_canonical else []
+    torch_threads = torch_alone if _is_light(scene, stage, evaluated) else nullcontext
     kept = _Kept(scene, state)
     while state.step < stage.steps and not _has_settled(stage, state):
         began = time.perf_counter()
-        moving = [entity for entity in entities if entity not in frozen] if needs_canonical else []
         frames = choose_frames(scene.n_frames, stage, seed, state.step)
         selection = Selection(
             frames,
@@ -160,19 +164,20 @@ def run_stage(
             seed=seed * 1_000_003 + state.step,
             free_frames=stage.free_frames,
             progress=state.step / max(stage.steps, 1),
-            pull=densify is not None and "object" in moving and densify.watches(stage.steps, state.step),
+            pull=densify is not None and "object" in evaluated and densify.watches(stage.steps, state.step),
         )
-        step = Step(scene, evidence, {**fixed, **scene.canonical(moving)}, selection)
-        values, problem = _evaluate(step, terms)
-        loss = weighted_sum(values, stage.weights) if problem is None else None
-        if loss is not None:
-            optimizer.zero_grad()
-            # No gradient where no term has anything to look at, as those of free Gaussians beside fields.
-            if loss.requires_grad:
-                loss.backward()
-            if stage.free_frames:
-                _spare_grasps(scene)
-            problem = _unbounded_gradient(scene, optimizer)
+        with torch_threads():
+            step = Step(scene, evidence, {**fixed, **scene.canonical(evaluated)}, selection)
+            values, problem = _evaluate(step, terms)
+            loss = weighted_sum(values, stage.weights) if problem is None else None
+            if loss is not None:
+                optimizer.zero_grad()
+                # No gradient where no term has anything to look at, as those of free Gaussians beside fields.
+                if loss.requires_grad:
+                    loss.backward()
+                if stage.free_frames:
+                    _spare_grasps(scene)
+                problem = _unbounded_gradient(scene, optimizer)
         if loss is None or problem is not None:
             where = f"stage {stage.name}, step {state.step}: {problem}"
             if state.retreats == MOST_RETREATS:
@@ -203,6 +208,15 @@ def run_stage(
         )
         fields_spared = once
     return state
+
+
+def _is_light(scene: Scene, stage: OptimizeStage, evaluated: Sequence[Entity]) -> bool:
+    """Whether torch has little to do in each of a step's operations, so that a second thread would not help.
+
+    Fields and networks are much work. What else is, the compiled code does.
+    """
+    fields = [entity for entity in evaluated if not isinstance(scene.splats(entity), FreeGaussians)]
+    return not fields and not {"perceptual", "sds"} & set(stage.weights)
 
 
 def _field_of_object(scene: Scene, stage: OptimizeStage) -> ObjectSplats:
