@@ -15,6 +15,7 @@ __all__ = [
     "TouchState",
     "__version__",
     "beyond_planes",
+    "border_distances",
     "cone_distances",
     "coverage_squares",
     "coverage_squares_backward",
@@ -354,6 +355,9 @@ def times_empty(
 
 def beyond_planes(points: NDArray[np.float64], planes: NDArray[np.float64]) -> NDArray[np.float64]:
     """The largest signed distance [N] of points [N, 3] to planes [M, 4]: normal and offset."""
+
+def border_distances(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Signed distances [H * W] in pixels to the border of a mask [H, W], negative inside."""
 
 @final
 class NearestPoints:

@@ -86,6 +86,15 @@ def beyond_planes(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
     return _raster.beyond_planes(_doubles(points), _doubles(planes))
 
 
+def border_distances(inside: np.ndarray) -> np.ndarray:
+    """Signed distances [H, W] in pixels to the border of a mask [H, W], negative inside.
+
+    Exact (Meijster et al., 2000), from pixels' centres, which are half a pixel from a border beside them.
+    Without a border all are about as far away as width and height together.
+    """
+    return _raster.border_distances(np.ascontiguousarray(inside)).reshape(inside.shape)
+
+
 class SymmetryJudge:
     """Judges symmetries of a surface: rows [M, 6] of a point and a direction, of axes [M] (bool) or planes.
 

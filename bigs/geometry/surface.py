@@ -44,22 +44,10 @@ def empty_grid(lower: np.ndarray, upper: np.ndarray, resolution: int) -> Distanc
     return DistanceGrid(np.zeros(shape), lower.copy(), spacing)
 
 
-def silhouette_distance(allowed: np.ndarray) -> np.ndarray:
-    """Signed distance in pixels to the border of a mask [H, W]: negative inside `allowed`."""
-    if allowed.all():
-        return np.full(allowed.shape, -float(max(allowed.shape)), dtype=np.float32)
-    if not allowed.any():
-        return np.full(allowed.shape, float(max(allowed.shape)), dtype=np.float32)
-    outside = scipy.ndimage.distance_transform_edt(~allowed)
-    inside = scipy.ndimage.distance_transform_edt(allowed)
-    # Both distances count from pixel centres, so the border between two pixels is half a pixel from either.
-    return (np.where(allowed, 0.5 - inside, outside - 0.5)).astype(np.float32)
-
-
 def silhouette_around_points(
     allowed: np.ndarray, points_cam: np.ndarray, K: np.ndarray, tolerance: float = 0.006
 ) -> np.ndarray:
-    """`silhouette_distance` of a mask that does not contradict the object's own points.
+    """`border_distances` of a mask that does not contradict the object's own points.
 
     A patch of points well outside `allowed` means that something unlabelled hides the object there; single
     ones are strays. Where there are such patches, the mask is opened around them.
@@ -70,7 +58,7 @@ def silhouette_around_points(
         K: [3, 3].
         tolerance: metres by which pose errors may put a point outside.
     """
-    distance = silhouette_distance(allowed)
+    distance = fused.border_distances(allowed)
     height, width = allowed.shape
     front = points_cam[points_cam[:, 2] > 1e-3]
     pixels = np.rint(front[:, :2] / front[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5).astype(int)
@@ -86,7 +74,7 @@ def silhouette_around_points(
     together = scipy.ndimage.uniform_filter(hits, side, mode="constant") * side * side
     if together.max() < _PATCH - 0.5:
         return distance
-    return silhouette_distance(allowed | (together >= _PATCH - 0.5))
+    return fused.border_distances(allowed | (together >= _PATCH - 0.5))
 
 
 # Multiples of it, less their whole part, are never near to one another for long.

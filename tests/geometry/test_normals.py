@@ -4,9 +4,10 @@ import numpy as np
 import scipy.ndimage
 from scipy.spatial.transform import Rotation
 
+from bigs.fused.shape import border_distances
 from bigs.geometry.coverage import ObjectViews, sphere_directions
 from bigs.geometry.normals import outward_normals, point_normals, turned_alike
-from bigs.geometry.surface import VisualHull, silhouette_distance
+from bigs.geometry.surface import VisualHull
 
 RADIUS = 0.05
 
@@ -52,7 +53,7 @@ def test_sightings_decide_where_silhouettes_say_nothing() -> None:
     # The object fills every picture.
     shown = np.ones((30, 240, 240), dtype=bool)
     views = ObjectViews(shown, K, rotations, centers)
-    hull = VisualHull(np.stack([silhouette_distance(mask) for mask in shown]), K, rotations, centers, 3)
+    hull = VisualHull(np.stack([border_distances(mask) for mask in shown]), K, rotations, centers, 3)
     found = outward_normals(points, hull, views, 0.002, 0.006)
     # Towards the cameras, although the middle of the points says otherwise.
     assert (found[:1200, 2] < 0.0).mean() > 0.98
@@ -69,6 +70,6 @@ def test_rough_outlines_do_not_turn_normals() -> None:
     noise = [scipy.ndimage.zoom(rng.uniform(-3.0, 3.0, (21, 21)), 240 / 21, order=1) for _ in range(40)]
     masks = inside + np.stack(noise) > 0.0
     views = ObjectViews(masks, K, rotations, centers)
-    hull = VisualHull(np.stack([silhouette_distance(mask) for mask in masks]), K, rotations, centers, 3)
+    hull = VisualHull(np.stack([border_distances(mask) for mask in masks]), K, rotations, centers, 3)
     found = outward_normals(RADIUS * directions, hull, views, 0.002, 0.006)
     assert ((found * directions).sum(-1) > 0.0).mean() > 0.995

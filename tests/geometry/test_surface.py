@@ -7,6 +7,7 @@ import pytest
 import scipy.spatial
 import trimesh
 
+from bigs.fused.shape import border_distances
 from bigs.geometry.surface import (
     DistanceGrid,
     VisualHull,
@@ -17,7 +18,6 @@ from bigs.geometry.surface import (
     inlier_points,
     plane_scatter,
     silhouette_around_points,
-    silhouette_distance,
 )
 
 RADIUS, DISTANCE = 0.05, 0.5
@@ -56,7 +56,7 @@ def masks_and_hull() -> tuple[np.ndarray, VisualHull]:
     rotations = np.stack([looking_along(d) for d in even_directions(40)])
     centers = np.tile([0.01, -0.02, DISTANCE], (40, 1))
     masks = np.stack([ball_mask(r @ MIDDLE + c) for r, c in zip(rotations, centers, strict=True)])
-    silhouettes = np.stack([silhouette_distance(mask) for mask in masks])
+    silhouettes = np.stack([border_distances(mask) for mask in masks])
     return masks, VisualHull(silhouettes, K, rotations, centers)
 
 
@@ -80,14 +80,6 @@ def test_grid_covers_its_box_with_cubes() -> None:
     assert (points[-1, -1, -1] >= upper - 1e-9).all()
     assert (points[-1, -1, -1] < upper + 1.01 * grid.spacing).all()
     np.testing.assert_allclose(points[3, 1, 2], lower + 0.05 * np.array([3, 1, 2]))
-
-
-def test_silhouette_distance_counts_from_the_border_between_pixels() -> None:
-    allowed = np.zeros((5, 9), dtype=bool)
-    allowed[:, :4] = True
-    expected = np.arange(9) - 3.5
-    np.testing.assert_allclose(silhouette_distance(allowed), np.tile(expected, (5, 1)))
-    assert (silhouette_distance(np.ones((5, 9), dtype=bool)) <= -9).all()
 
 
 def test_hull_of_a_ball_has_its_radius(hull: VisualHull) -> None:
@@ -125,7 +117,7 @@ def test_hull_stops_only_where_it_may(hull: VisualHull) -> None:
 
 
 def test_points_that_no_frame_sees_count_as_inside() -> None:
-    silhouette = silhouette_distance(ball_mask(np.array([0.0, 0.0, DISTANCE])))
+    silhouette = border_distances(ball_mask(np.array([0.0, 0.0, DISTANCE])))
     one = VisualHull(silhouette[None], K, np.eye(3)[None], np.array([[0.0, 0.0, DISTANCE]]))
     behind, aside, outside = one.distance(np.array([[0.0, 0, -1.0], [0.9, 0, 0], [0.09, 0, 0]]))
     assert behind == aside == -1.0
@@ -134,7 +126,7 @@ def test_points_that_no_frame_sees_count_as_inside() -> None:
 
 def test_one_wrong_frame_carves_nothing_when_two_must_agree(hull: VisualHull) -> None:
     wrong = hull.silhouettes.copy()
-    wrong[7] = silhouette_distance(np.tile(np.arange(SIZE[1]) < 3, (SIZE[0], 1)))
+    wrong[7] = border_distances(np.tile(np.arange(SIZE[1]) < 3, (SIZE[0], 1)))
     points = MIDDLE + 0.8 * RADIUS * even_directions(50)
     alone = replace(hull, silhouettes=wrong).distance(points)
     agreed = replace(hull, silhouettes=wrong, agreeing=2).distance(points)
@@ -185,7 +177,7 @@ def test_a_patch_of_points_opens_the_silhouette_around_it() -> None:
 
 def test_strays_small_errors_and_unseen_points_open_nothing() -> None:
     allowed = half_allowed()
-    plain = silhouette_distance(allowed)
+    plain = border_distances(allowed)
     strays = at_pixels(np.array([130.0, 20, 160]), np.array([30.0, 80, 140]))
     # 6 mm are 3.6 pixels here: a patch two pixels outside is within the poses' error.
     near = at_pixels(np.repeat([90.0, 91.0], 10), np.tile(np.arange(10.0), 2))

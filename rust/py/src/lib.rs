@@ -357,6 +357,7 @@ fn _raster(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(shape::times_seen, m)?)?;
     m.add_function(wrap_pyfunction!(shape::times_empty, m)?)?;
     m.add_function(wrap_pyfunction!(shape::beyond_planes, m)?)?;
+    m.add_function(wrap_pyfunction!(shape::border_distances, m)?)?;
     m.add_function(wrap_pyfunction!(measure::fma_peak_gflops, m)?)?;
     m.add_function(wrap_pyfunction!(measure::time_engine, m)?)
 }

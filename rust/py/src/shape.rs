@@ -144,6 +144,24 @@ pub(crate) fn beyond_planes<'py>(
     Ok(gradient(py, distances))
 }
 
+/// Signed distances in pixels from each pixel of a mask `[H, W]` to its border, negative inside. Raises ValueError.
+#[pyfunction]
+pub(crate) fn border_distances<'py>(
+    py: Python<'py>,
+    inside: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyArray1<f32>>> {
+    let inside = slice("inside", inside)?;
+    let &[height, width] = inside.shape() else {
+        return Err(PyValueError::new_err(format!(
+            "inside: expected the shape (H, W), found {:?}",
+            inside.shape()
+        )));
+    };
+    let pixels = contiguous("inside", &inside)?;
+    let distances = run(py, || bigs_shape::border_distances(pixels, width, height))?;
+    Ok(gradient(py, distances))
+}
+
 /// Judges symmetries of a surface. Opaque; symmetries are rows of a point and a direction, axes or planes.
 #[pyclass(frozen, module = "bigs._raster")]
 pub(crate) struct SymmetryJudge {

@@ -1,6 +1,6 @@
 //! What many views of an object say about its shape: where the cones of its silhouettes leave room ([`Views::cones`]),
 //! what of its surface showed and what hid nothing ([`Views::times_seen`], [`Views::times_empty`]), how far places are
-//! beyond planes ([`beyond_planes`]), what a symmetry carries onto what was seen ([`Judge`]), and which points of one shape
+//! beyond planes ([`beyond_planes`]), how far pixels are from a mask's border ([`border_distances`]), what a symmetry carries onto what was seen ([`Judge`]), and which points of one shape
 //! are nearest to those of another ([`Neighbours`]).
 //!
 //! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
@@ -19,6 +19,7 @@
     )
 )]
 
+mod border;
 mod cones;
 mod depths;
 mod error;
@@ -30,6 +31,7 @@ mod refine;
 mod symmetry;
 mod views;
 
+pub use border::border_distances;
 pub use cones::Cones;
 pub use depths::Facing;
 pub use error::ShapeError;

@@ -1,6 +1,8 @@
 //! Shapes whose answers are formulas: a ball before a camera, a box's mirror planes.
 
-use bigs_shape::{Cones, Empty, Facing, Judge, Kind, Samples, Symmetry, Vec3, Views, beyond_planes};
+use bigs_shape::{
+    Cones, Empty, Facing, Judge, Kind, Samples, Symmetry, Vec3, Views, beyond_planes, border_distances,
+};
 
 const SIDE: usize = 120;
 const RADIUS: f64 = 0.05;
@@ -245,4 +247,30 @@ fn what_does_not_fit_or_is_no_number() {
         judge.agreement(&[plane([f64::NAN; 3], [1.0, 0.0, 0.0])])[0].support,
         0.0
     );
+}
+
+#[test]
+fn a_masks_border_is_as_far_as_the_nearest_pixel_across() {
+    let mut rng = fastrand::Rng::with_seed(3);
+    let (width, height) = (31, 23);
+    let inside: Vec<bool> = (0..width * height).map(|_| rng.f64() < 0.9).collect();
+    let expected = (0..width * height).map(|here| {
+        let across = (0..width * height).filter(|&there| inside[there] != inside[here]);
+        let square = across.map(|there| {
+            let (x, y) = (
+                (here % width).abs_diff(there % width),
+                (here / width).abs_diff(there / width),
+            );
+            x * x + y * y
+        });
+        let distance = (square.min().unwrap() as f64).sqrt() - 0.5;
+        (if inside[here] { -distance } else { distance }) as f32
+    });
+    let expected: Vec<f32> = expected.collect();
+    for threads in [1, 2, 5] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        let found = pool.unwrap().install(|| border_distances(&inside, width, height));
+        assert_eq!(found.unwrap(), expected);
+    }
+    assert!(border_distances(&inside, width, height + 1).is_err());
 }

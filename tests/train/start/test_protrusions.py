@@ -12,9 +12,10 @@ import trimesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
+from bigs.fused.shape import border_distances
 from bigs.geometry.coverage import ObjectViews
 from bigs.geometry.mesh import sample_surface
-from bigs.geometry.surface import DistanceGrid, VisualHull, empty_grid, silhouette_distance
+from bigs.geometry.surface import DistanceGrid, VisualHull, empty_grid
 from bigs.train.plan.start_config import InitialConfig
 from bigs.train.start.protrusions import protruding
 from bigs.train.start.visual_hull import ObjectHull
@@ -46,7 +47,7 @@ def turning(with_bar: range) -> ObjectHull:
     # Where the bar is missing something hides it, so that the hull has it all the same.
     allowed = masks.copy()
     allowed[[t for t in range(FRAMES) if t not in with_bar]] = True
-    hull = VisualHull(np.stack([silhouette_distance(mask) for mask in allowed]), K, rotations, centers)
+    hull = VisualHull(np.stack([border_distances(mask) for mask in allowed]), K, rotations, centers)
     points, normals = sample_surface(np.asarray(BODY.vertices), np.asarray(BODY.faces), 600)
     distance = hull.distance(grid.points()).reshape(grid.values.shape)
     return ObjectHull(
@@ -119,7 +120,7 @@ def test_outlines_that_are_off_ask_for_nothing() -> None:
     hull = turning(range(0))
     rough = np.stack([binary_dilation(mask, iterations=5) for mask in hull.views.shown])
     views = replace(hull.views, shown=rough)
-    outside = VisualHull(np.stack([silhouette_distance(mask) for mask in rough]), *views.poses)
+    outside = VisualHull(np.stack([border_distances(mask) for mask in rough]), *views.poses)
     distance = outside.distance(hull.grid.points()).reshape(hull.grid.values.shape)
     hull = replace(hull, grid=replace(hull.grid, values=distance), views=views)
     assert len(hull.closed(InitialConfig(), hull.points, hull.normals).held_at) == len(hull.points)

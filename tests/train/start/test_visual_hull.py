@@ -10,13 +10,13 @@ import scipy.spatial
 import skimage.draw
 from scipy.spatial.transform import Rotation
 
+from bigs.fused.shape import border_distances
 from bigs.geometry.coverage import ObjectViews
 from bigs.geometry.surface import (
     DistanceGrid,
     VisualHull,
     convex_distance,
     empty_grid,
-    silhouette_distance,
 )
 from bigs.geometry.symmetry import Symmetry
 from bigs.train.plan.start_config import InitialConfig
@@ -44,7 +44,7 @@ def turning_box(most: float, deep: float = 0.0) -> ObjectHull:
         outline = pixels[scipy.spatial.ConvexHull(pixels).vertices]
         mask[skimage.draw.polygon(outline[:, 1], outline[:, 0], mask.shape)] = True
     grid = empty_grid(np.full(3, -0.08), np.full(3, 0.08), 64)
-    silhouettes = np.stack([silhouette_distance(mask) for mask in masks])
+    silhouettes = np.stack([border_distances(mask) for mask in masks])
     hull = VisualHull(silhouettes, K, rotations, centers).distance(grid.points())
     side = np.linspace(-1.0, 1.0, 12)
     x, y = (HALF[0] * values.ravel() for values in np.meshgrid(side, side))
