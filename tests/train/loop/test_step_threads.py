@@ -14,7 +14,7 @@ from bigs.models.hand_detail import free_hand
 from bigs.models.object_detail import split_object
 from bigs.models.scene import Scene
 from bigs.threads import thread_count
-from bigs.train.loop.run_stage import run_stage
+from bigs.train.loop.run_stage import _is_light, run_stage
 from bigs.train.loop.step import Evidence, Step
 from bigs.train.loop.terms import TERMS, Term
 from bigs.train.plan.config import OptimizeStage
@@ -63,3 +63,9 @@ def test_free_gaussians_do_not(scene: Scene, evidence: Evidence, monkeypatch: py
     scene.object_splats = split_object(scene.object_splats(), 1, 0.0)
     scene.hand_splats["right"] = free_hand(scene.hand_splats["right"])
     assert threads_seen(scene, COLORS, evidence, monkeypatch) == 1
+
+
+@pytest.mark.parametrize("network", ["perceptual", "sds"])
+def test_networks_do(scene: Scene, network: str) -> None:
+    assert _is_light(scene, POSES_ONLY, [])
+    assert not _is_light(scene, replace(POSES_ONLY, weights={"pose_prior": 1.0, network: 1.0}), [])
