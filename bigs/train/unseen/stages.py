@@ -43,8 +43,9 @@ def run_completion(
         config.object,
         earlier,
     )
-    if scene.lighting is not None and scene.lighting.measured:
-        # For the surface as it is now, and for the Gaussians there.
+    if done.skipped is None and scene.lighting is not None and scene.lighting.measured:
+        # For the surface as it is now, and for the Gaussians there. What stays as it is keeps the occlusion
+        # that its colours were learned with.
         measure_occlusion(scene)
     return done
 

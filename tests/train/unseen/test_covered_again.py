@@ -15,6 +15,11 @@ from bigs.train.unseen import stages
 from bigs.train.unseen.symmetry_stage import StageOutcome
 
 
+def run_completion(scene: Scene) -> None:
+    sources = SimpleNamespace(clip=None, unknown=None, evidence=lambda stage: None)
+    stages.run_completion(scene, CompletionStage(), sources, SMOKE, ())
+
+
 @pytest.mark.parametrize("measured", [False, True])
 def test_completion_measures_occlusion_where_it_was_measured(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, measured: bool
@@ -29,10 +34,22 @@ def test_completion_measures_occlusion_where_it_was_measured(
         return StageOutcome(None, {})
 
     monkeypatch.setattr(stages, "complete_scene", completed)
-    sources = SimpleNamespace(clip=None, unknown=None, evidence=lambda stage: None)
-    stages.run_completion(scene, CompletionStage(), sources, SMOKE, ())
+    run_completion(scene)
     after = scene.lighting.occlusion["object"].places
     if measured:
         assert after.norm(dim=1).max() > 1.3 * before.norm(dim=1).max()
     else:
         assert torch.equal(after, before) and not scene.lighting.measured
+
+
+def test_colors_keep_the_occlusion_they_were_learned_with(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing is completed, frames look as they did in the last step, though poses have moved since."""
+    measure_occlusion(scene)
+    before = scene.lighting.occlusion["object"].at(scene.object_splats.base_points).clone()
+    with torch.no_grad():
+        scene.hand_poses["right"].position.log_depth += 0.1
+    monkeypatch.setattr(stages, "complete_scene", lambda *given: StageOutcome("nothing to do", {}))
+    run_completion(scene)
+    assert torch.equal(scene.lighting.occlusion["object"].at(scene.object_splats.base_points), before)
