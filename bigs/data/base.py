@@ -94,6 +94,7 @@ class Clip:
     black: float = 0.0
     brightness: float = 1.0
     notes: tuple[str, ...] = ()  # what was odd in the estimates or was taken out (see `plausible`)
+    # The frames that were read so far.
     decoded: DecodedFrames = field(default_factory=DecodedFrames, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -17,7 +17,6 @@ from bigs.types import ENTITIES, MASK_VALUES, Entity
 # Bytes that are kept: 60 frames of 800 x 600 with their masks.
 _MOST = 128 * 2**20
 
-
 # Reads a file of a size (width, height).
 _Reader = Callable[[Path, tuple[int, int]], np.ndarray]
 
