@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from small_clip import FRAMES, HEIGHT, SHIFT, WIDTH, K, random_hand, random_object, small_masks
 
+import bigs.data.decoded
 from bigs.data.formats.hold import write_hold
+from bigs.data.images import read_image, read_mask
 from bigs.data.synthetic import make_clip
 from bigs.hand import HandModel, load_hand_models
 from bigs.types import Side
@@ -74,3 +77,21 @@ def shared_clip(request: pytest.FixtureRequest) -> Path:
     if not folder:
         pytest.skip("BIGS_CLIPS is not set")
     return Path(folder) / request.param
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each file was decoded."""
+    counted: Counter[str] = Counter()
+
+    def image(path: Path, size: tuple[int, int]) -> np.ndarray:
+        counted[path.parent.name + path.name] += 1
+        return read_image(path, size)
+
+    def mask(path: Path, size: tuple[int, int]) -> np.ndarray:
+        counted[path.parent.name + path.name] += 1
+        return read_mask(path, size)
+
+    monkeypatch.setattr(bigs.data.decoded, "read_image", image)
+    monkeypatch.setattr(bigs.data.decoded, "read_mask", mask)
+    return counted

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +13,11 @@ import pytest
 from PIL import Image
 from toy_clips import painted_clip
 
-import bigs.data.decoded
 from bigs.checks import InputError
+from bigs.data import load_clip
 from bigs.data.decoded import DecodedFrames
-from bigs.data.images import read_image, read_mask
 
 SIZE = (7, 5)
-
-
-@pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """How often each file was decoded."""
-    counted: Counter[str] = Counter()
-
-    def image(path: Path, size: tuple[int, int]) -> np.ndarray:
-        counted[path.parent.name + path.name] += 1
-        return read_image(path, size)
-
-    def mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-        counted[path.parent.name + path.name] += 1
-        return read_mask(path, size)
-
-    monkeypatch.setattr(bigs.data.decoded, "read_image", image)
-    monkeypatch.setattr(bigs.data.decoded, "read_mask", mask)
-    return counted
 
 
 def frames(folder: Path, count: int) -> list[Path]:
@@ -56,7 +38,16 @@ def test_a_clip_decodes_each_file_once(tmp_path: Path, reads: Counter[str]) -> N
     assert set(reads.values()) == {1} and len(reads) == 6
 
 
-def test_checking_a_clip_is_its_first_reading(tmp_path: Path, reads: Counter[str]) -> None:
+def test_loading_a_clip_is_its_first_reading(tiny_clip: Path, reads: Counter[str]) -> None:
+    clip = load_clip(tiny_clip, np.zeros((15, 3)))
+    for other in (clip, replace(clip, K=2.0 * clip.K)):
+        for t in range(len(clip)):
+            other.image(t)
+            other.mask(t)
+    assert set(reads.values()) == {1} and len(reads) == 2 * len(clip)
+
+
+def test_checking_frames_is_their_first_reading(tmp_path: Path, reads: Counter[str]) -> None:
     paths = frames(tmp_path, 2)
     decoded = DecodedFrames()
     decoded.read_all(paths, (), SIZE)

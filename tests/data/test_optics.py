@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -146,6 +147,16 @@ def egocentric(root: Path, **fields: np.ndarray) -> None:
     }
     file = root / "raw_seqs" / "s01" / "box_grab_01.egocam.dist.npy"
     np.save(file, np.array(standing | fields, dtype=np.object_))
+
+
+def test_a_bent_picture_is_decoded_once(root: Path, reads: Counter[str]) -> None:
+    egocentric(root, dist8=LENS)
+    clip = load_arctic(rewrite(root, 0, lambda t: distorted_picture()))
+    assert clip.optics is not None
+    for _ in range(2):
+        for t in range(FRAMES):
+            clip.image(t)
+    assert set(reads.values()) == {1} and len(reads) == FRAMES
 
 
 def test_arctics_egocentric_view_is_straightened(root: Path) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import struct
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,16 @@ def test_the_clip_is_the_same(
     for t in (0, 11):
         np.testing.assert_array_equal(clip.image(t), tiny.image(t))
         np.testing.assert_array_equal(clip.mask(t), tiny.mask(t))
+
+
+def test_frames_are_decoded_once(tmp_path: Path, in_camera: Clip, reads: Counter[str]) -> None:
+    folder = write_nerfstudio(tmp_path / "clip", in_camera)
+    reads.clear()
+    clip = load_sfm_folder(folder)
+    for t in range(len(clip)):
+        clip.image(t)
+        clip.mask(t)
+    assert set(reads.values()) == {1} and len(reads) == 2 * len(clip)
 
 
 def test_numbers_that_are_left_out_tell_the_rate(tmp_path: Path, in_camera: Clip) -> None:
