@@ -14,8 +14,7 @@ const ROWS: usize = 16;
 /// The mask has not `width` times `height` pixels.
 pub fn border_distances(inside: &[bool], width: usize, height: usize) -> Result<Vec<f32>, ShapeError> {
     ShapeError::check("mask", width * height, inside.len())?;
-    let far = width + height;
-    let upright = upright_distances(inside, width, far);
+    let upright = upright_distances(inside, width, width + height);
     let mut distances = vec![0.0; inside.len()];
     let piece = (ROWS * width).max(1);
     (
@@ -31,7 +30,7 @@ pub fn border_distances(inside: &[bool], width: usize, height: usize) -> Result<
                 let mut from = 0;
                 for run in inside.chunk_by(|a, b| a == b) {
                     let to = from + run.len();
-                    envelope.measure(upright, from, to, far, &mut distances[from..to]);
+                    envelope.measure(upright, from, to, &mut distances[from..to]);
                     if run[0] {
                         distances[from..to]
                             .iter_mut()
@@ -75,7 +74,7 @@ impl Envelope {
     /// The distances of a run `from..to` of a row in which all pixels lie on one side of the border.
     ///
     /// Nothing beyond its two neighbours is nearer than they are.
-    fn measure(&mut self, upright: &[usize], from: usize, to: usize, far: usize, distances: &mut [f32]) {
+    fn measure(&mut self, upright: &[usize], from: usize, to: usize, distances: &mut [f32]) {
         let run = from as i64..to as i64;
         let square = |place: i64| {
             if run.contains(&place) {
@@ -108,7 +107,7 @@ impl Envelope {
                 self.parts.pop();
             }
             let nearest = self.parts.last().map_or(0, |&(place, _)| value(x, place));
-            *distance = ((nearest as f64).sqrt().min(far as f64) - 0.5) as f32;
+            *distance = ((nearest as f64).sqrt() - 0.5) as f32;
         }
     }
 }

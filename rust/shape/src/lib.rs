@@ -1,7 +1,7 @@
 //! What many views of an object say about its shape: where the cones of its silhouettes leave room ([`Views::cones`]),
 //! what of its surface showed and what hid nothing ([`Views::times_seen`], [`Views::times_empty`]), how far places are
-//! beyond planes ([`beyond_planes`]), how far pixels are from a mask's border ([`border_distances`]), what a symmetry carries onto what was seen ([`Judge`]), and which points of one shape
-//! are nearest to those of another ([`Neighbours`]).
+//! beyond planes ([`beyond_planes`]) and pixels from a mask's border ([`border_distances`]), what a symmetry carries onto
+//! what was seen ([`Judge`]), and which points of one shape are nearest to those of another ([`Neighbours`]).
 //!
 //! Arrays are C-contiguous and borrowed; their lengths are checked once, and nothing panics on their values. Work is
 //! shared among rayon's threads in pieces of a fixed size, and sums have a fixed order, so that the number of threads
